@@ -1,0 +1,34 @@
+"""The environments, by name: `make("ant_maze", obs_noise=0.02)`. See `envs.base` for what an environment is."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+from envs.ant_maze import make_ant_maze
+from envs.base import Coverage, Environment, EnvSpec, EnvState, FloorPlan, check_choice
+
+FACTORIES: dict[str, Callable[..., Environment]] = {
+    "ant_maze": make_ant_maze,
+}
+"""Name of an environment, and what makes it. A new environment is one line here."""
+
+
+def make(name: str, **options: Any) -> Environment:
+    """The environment called `name`.
+
+    Args:
+        name: one of `FACTORIES`.
+        **options: the factory's own arguments, such as `backend` and `obs_noise`.
+
+    Raises:
+        ValueError: an unknown name or option, with the nearest match and the list of those that are known; or an
+            option's value that the factory refuses.
+    """
+    check_choice("name of the environment", name, FACTORIES)
+    factory = FACTORIES[name]
+    for option in options:
+        check_choice(f"option of {name!r}", option, inspect.signature(factory).parameters)
+    return factory(**options)
+
+
+__all__ = ["FACTORIES", "Coverage", "EnvSpec", "EnvState", "Environment", "FloorPlan", "make"]

@@ -1,0 +1,175 @@
+"""What an environment is: a spec and two functions, `reset(key)` and `step(state, action)`.
+
+The same shape holds for environments whose physics runs on the device (MJX, pure JAX; `compiled=True`: jit, vmap and
+scan as you like) and for those whose physics runs on the host (C MuJoCo; `compiled=False`: call them from Python, the
+state holds NumPy arrays). In both the state is a pytree that holds *everything*: saving it and stepping from it again
+gives the same numbers to the bit.
+
+No environment resets itself. `Transition.next_obs` is always the true successor; whoever collects calls `reset` when
+`terminated` or `truncated` is set (`envs.wrappers` has that loop for both kinds).
+"""
+
+import difflib
+import importlib
+import math
+import numbers
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import jax
+from flax import struct
+
+from jaxplore.types import Array, Key, Transition
+
+
+@struct.dataclass
+class EnvState:
+    """Everything an environment needs to go on."""
+
+    physics: Any
+    """The engine's own state: `mjx_backend.MjxState`, or C MuJoCo's integration state vector; see `Physics`."""
+    obs: Array
+    """The observation that the agent sees now, `[O]`, float32, with observation noise if there is any."""
+    num_steps: Array
+    """Steps taken in this episode, int32."""
+    key: Key
+    """Source of the randomness still to come in this episode (observation noise)."""
+
+
+@dataclass(frozen=True)
+class EnvSpec:
+    """What can be known of an environment without running it."""
+
+    name: str
+    obs_names: tuple[str, ...]
+    """Name and unit of each observation entry, such as `"x [m]"`."""
+    action_names: tuple[str, ...]
+    """Name of each action entry; all actions are in [-1, 1]."""
+    episode_steps: int
+    """Steps after which an episode is truncated."""
+    dt: float
+    """Seconds between two steps."""
+
+    @property
+    def obs_size(self) -> int:
+        """Entries of an observation (`O`)."""
+        return len(self.obs_names)
+
+    @property
+    def action_size(self) -> int:
+        """Entries of an action (`A`)."""
+        return len(self.action_names)
+
+
+class Coverage(NamedTuple):
+    """Which parts of an environment have been seen: a fixed set of cells and a look-up. Pure JAX, unbatched."""
+
+    num_cells: int
+    cell: Callable[[Array], Array]
+    """`cell(obs [O]) -> int32`: the cell that an observation lies in, 0 to num_cells - 1, or -1 outside of all."""
+    unit: str
+    """What a cell is, for axis labels, such as `"maze cells"`."""
+
+
+class FloorPlan(NamedTuple):
+    """A view from above, for pictures. Metres."""
+
+    position: tuple[int, int]
+    """Indices of x and y in the observation."""
+    walls: tuple[tuple[float, float, float, float], ...]
+    """Axis-aligned boxes `(x_min, y_min, x_max, y_max)`."""
+    cells: tuple[tuple[float, float, float, float], ...]
+    """The coverage cells, in the order of their index."""
+
+
+class View(NamedTuple):
+    """What drawing an environment takes."""
+
+    model: "mujoco.MjModel"
+    """With cameras "track" and "overview"."""
+    qpos: Callable[[EnvState], Array]
+    """`qpos(state) -> [nq]`: the model's positions in a state."""
+
+
+@dataclass(frozen=True)
+class Environment:
+    """An environment. See the module's text for the contract."""
+
+    spec: EnvSpec
+    reset: Callable[[Key], EnvState]
+    """`reset(key) -> state`, the same state for the same key."""
+    step: Callable[[EnvState, Array], tuple[EnvState, Transition]]
+    """`step(state, action [A]) -> (state, transition)`; `transition.next_obs` is the new state's observation."""
+    coverage: Coverage
+    backend: str
+    """Which engine steps it, such as `"mjx"` or `"mujoco"`."""
+    compiled: bool
+    """True: pure JAX. False: runs on the host, one environment a call."""
+    floor_plan: FloorPlan | None = None
+    view: View | None = None
+
+
+class Physics(NamedTuple):
+    """A physics engine with one model in it. The state holds everything it needs to go on to the bit."""
+
+    init: Callable[[Array, Array], Any]
+    """`init(qpos [nq], qvel [nv]) -> physics`: at rest otherwise."""
+    step: Callable[[Any, Array], Any]
+    """`step(physics, ctrl [nu]) -> physics`: one environment step, with `ctrl` held over all its substeps."""
+    qpos: Callable[[Any], Array]
+    """`qpos(physics) -> [nq]`, metres and radians."""
+    qvel: Callable[[Any], Array]
+    """`qvel(physics) -> [nv]`, per second."""
+
+
+class Task(NamedTuple):
+    """All that an environment on top of MuJoCo is beside its engine; the engines' `make_environment` runs it."""
+
+    spec: EnvSpec
+    model: Any
+    """A `mujoco.MjModel`."""
+    frame_skip: int
+    """Substeps of `model.opt.timestep` in one environment step."""
+    start: Callable[[Key], tuple[Array, Array]]
+    """`start(key) -> (qpos [nq], qvel [nv])`, in JAX: the state an episode begins in."""
+    observe: Callable[[ModuleType, Array, Array, Array], Array]
+    """`observe(xp, qpos_before [nq], qpos [nq], qvel [nv]) -> [O]`; `xp` is `numpy` or `jax.numpy`. The positions are
+    those before and after the step, equal at a reset."""
+    reward: Callable[[ModuleType, Array, Array], Array | float]
+    """`reward(xp, action [A], obs [O])` with the observation after the step, free of noise."""
+    coverage: Coverage
+    floor_plan: FloorPlan | None = None
+
+
+ENGINES = {"mjx": "envs.mjx_backend", "mujoco": "envs.host_backend"}
+
+
+def choose_engine(backend: str) -> ModuleType:
+    """The module that runs a `Task` on `backend`: `"mjx"`, `"mujoco"`, or `"auto"` (MuJoCo on a CPU, else MJX).
+
+    Raises `ValueError` for any other name.
+    """
+    check_choice("backend", backend, ("auto", *ENGINES))
+    if backend == "auto":
+        backend = "mujoco" if jax.default_backend() == "cpu" else "mjx"
+    return importlib.import_module(ENGINES[backend])
+
+
+def check_choice(field: str, value: str, allowed: Iterable[str]) -> None:
+    """Raises `ValueError` with the nearest match and the list of what is allowed, unless `value` is in `allowed`."""
+    allowed = sorted(allowed)
+    if value not in allowed:
+        nearest = difflib.get_close_matches(str(value), allowed, n=1)
+        hint = f" Did you mean {nearest[0]!r}?" if nearest else ""
+        raise ValueError(f"{field} is {value!r}.{hint} Allowed: {', '.join(allowed) or 'none'}.")
+
+
+def check_noise(obs_noise: float) -> float:
+    """Returns `obs_noise`. Raises `ValueError` unless it is a finite number of at least 0."""
+    if not (isinstance(obs_noise, numbers.Real) and math.isfinite(obs_noise) and obs_noise >= 0):
+        raise ValueError(
+            f"obs_noise is {obs_noise!r}. Allowed: a finite standard deviation of at least 0, in raw units."
+        )
+    return float(obs_noise)

@@ -1,0 +1,125 @@
+"""C MuJoCo on the host: NumPy in, NumPy out, one environment a call. The fast engine where there is no accelerator.
+
+The state is MuJoCo's integration state, a float64 vector: time, positions, velocities, and the solver's warm start.
+One `MjData` serves as scratch space and is set from that vector on every step, so stepping a saved state again gives
+the same bits. As the scratch space is shared, one environment must not be stepped from two threads at once.
+"""
+# pyright: reportAttributeAccessIssue=false, reportArgumentType=false, reportReturnType=false
+# mujoco ships no stubs, and NumPy arrays stand where the contract says Array.
+
+import copy
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from envs.base import Environment, EnvState, Physics, Task, View, check_noise
+from jaxplore.types import Array, Key, Transition
+
+BACKEND = "mujoco"
+STATE = mujoco.mjtState.mjSTATE_INTEGRATION
+
+
+def make_physics(model: mujoco.MjModel, frame_skip: int) -> Physics:
+    """C MuJoCo as a `Physics`: `frame_skip` substeps of `model.opt.timestep` seconds a step.
+
+    A diverged state stays as it is: MuJoCo's own reset of such states is off, and so is the log file it would write.
+    """
+    model = copy.copy(model)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    data = mujoco.MjData(model)
+    # MuJoCo logs a warning of each kind to a file in the working directory, but only the first one.
+    data.warning.number[:] = 1
+    size, nq, nv = mujoco.mj_stateSize(model, STATE), model.nq, model.nv
+
+    def save() -> np.ndarray:
+        state = np.empty(size)
+        mujoco.mj_getState(model, data, state, STATE)
+        return state
+
+    blank = save()
+
+    def init(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
+        mujoco.mj_setState(model, data, blank, STATE)
+        data.qpos[:], data.qvel[:] = qpos, qvel
+        return save()
+
+    def step(state: np.ndarray, ctrl: np.ndarray) -> np.ndarray:
+        mujoco.mj_setState(model, data, state, STATE)
+        data.ctrl[:] = ctrl
+        mujoco.mj_step(model, data, frame_skip)
+        return save()
+
+    return Physics(init, step, qpos=lambda state: state[1 : 1 + nq], qvel=lambda state: state[1 + nq : 1 + nq + nv])
+
+
+def make_environment(task: Task, obs_noise: float = 0.0) -> Environment:
+    """`task` on C MuJoCo. See `envs.base` for the contract.
+
+    `step` clips actions to [-1, 1] and raises `ValueError` for an action that is not finite or not of shape `[A]`. A
+    state that is no longer finite ends the episode as `terminated`; `next_obs` is then what was computed.
+
+    Args:
+        task: what to run.
+        obs_noise: standard deviation of Gaussian noise added to every observation entry, in raw units. The physics
+            does not see it.
+
+    Raises:
+        ValueError: `obs_noise` is negative or not finite.
+    """
+    obs_noise = check_noise(obs_noise)
+    spec, physics = task.spec, make_physics(task.model, task.frame_skip)
+    action_shape = (spec.action_size,)
+
+    @jax.jit
+    def start(key: Key) -> tuple[Array, Array, Key]:
+        start_key, key = jax.random.split(key)
+        return *task.start(start_key), key
+
+    @jax.jit
+    def draw(key: Key) -> tuple[Key, Array]:
+        key, noise_key = jax.random.split(key)
+        return key, obs_noise * jax.random.normal(noise_key, (spec.obs_size,), jnp.float32)
+
+    def noisy(key: Key, obs: np.ndarray) -> tuple[Key, np.ndarray]:
+        if obs_noise == 0:
+            return key, obs
+        key, noise = draw(key)
+        return key, obs + np.asarray(noise)
+
+    def observe(before: Any, after: Any) -> np.ndarray:
+        with np.errstate(over="ignore", invalid="ignore"):  # A diverged state is for `terminated` to tell.
+            obs = task.observe(np, physics.qpos(before), physics.qpos(after), physics.qvel(after))
+            return obs.astype(np.float32)
+
+    def reset(key: Key) -> EnvState:
+        qpos, qvel, key = start(key)
+        state = physics.init(np.asarray(qpos), np.asarray(qvel))
+        key, obs = noisy(key, observe(state, state))
+        return EnvState(state, obs, np.int32(0), key)
+
+    def step(state: EnvState, action: Any) -> tuple[EnvState, Transition]:
+        action = np.asarray(action, np.float32)
+        if action.shape != action_shape:
+            raise ValueError(f"action has shape {action.shape}. Allowed: {action_shape}.")
+        if not np.isfinite(action).all():
+            raise ValueError(f"action is {action}. Allowed: finite numbers.")
+        action = np.clip(action, -1.0, 1.0)
+        after = physics.step(state.physics, action)
+        clean = observe(state.physics, after)
+        key, obs = noisy(state.key, clean)
+        num_steps = np.int32(state.num_steps + 1)
+        transition = Transition(
+            obs=state.obs,
+            action=action,
+            reward=np.float32(task.reward(np, action, clean)),
+            next_obs=obs,
+            terminated=np.bool_(not np.isfinite(after).all()),
+            truncated=np.bool_(num_steps >= spec.episode_steps),
+        )
+        return EnvState(after, obs, num_steps, key), transition
+
+    view = View(task.model, lambda state: physics.qpos(state.physics))
+    return Environment(spec, reset, step, task.coverage, BACKEND, False, task.floor_plan, view)

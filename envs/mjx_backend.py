@@ -1,0 +1,127 @@
+"""MJX: MuJoCo's physics in pure JAX. `jit`, `vmap` and `scan` as you like; the engine for accelerators.
+
+The state holds what the next step depends on and no more, as C MuJoCo's integration state does. MJX's `Data` is large
+(it holds every contact's Jacobian) and is made anew within each step, so states are cheap to keep, select and store.
+
+In float64 MJX agrees with C MuJoCo of the same version to rounding, but for two things. Where a capsule meets a plane
+at more than 60 degrees, C MuJoCo turns the friction pyramid along the capsule and MJX does not. And MJX has no contact
+of capsule and box before they touch: give such pairs margin 0.
+"""
+# pyright: reportAttributeAccessIssue=false
+# mujoco ships no stubs.
+
+import contextlib
+import io
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+
+from envs.base import Environment, EnvState, Physics, Task, View, check_noise
+from jaxplore.types import Array, Key, Transition
+
+with contextlib.redirect_stdout(io.StringIO()):  # It prints that the optional Warp engine is absent.
+    from mujoco import mjx
+
+BACKEND = "mjx"
+
+
+@struct.dataclass
+class MjxState:
+    """What one step of MJX depends on, beside the control."""
+
+    time: Array
+    """Seconds of the episode so far."""
+    qpos: Array
+    """Positions, `[nq]`, metres and radians."""
+    qvel: Array
+    """Velocities, `[nv]`, per second."""
+    act: Array
+    """Actuator activations, `[na]`."""
+    qacc_warmstart: Array
+    """Where the constraint solver starts, `[nv]`."""
+
+
+def make_physics(model: mujoco.MjModel, frame_skip: int) -> Physics:
+    """MJX as a `Physics`: `frame_skip` substeps of `model.opt.timestep` seconds a step."""
+    # MJX commits arrays to a device; then so were every state, which compiles twice and cannot be sharded.
+    device_model, blank = jax.tree.map(
+        lambda leaf: jnp.asarray(np.asarray(leaf)), (mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax"))
+    )
+
+    def init(qpos: Array, qvel: Array) -> MjxState:
+        dtype = blank.qpos.dtype
+        return MjxState(blank.time, qpos.astype(dtype), qvel.astype(dtype), blank.act, blank.qacc_warmstart)
+
+    def step(state: MjxState, ctrl: Array) -> MjxState:
+        def substep(_: int, state: MjxState) -> MjxState:
+            data = blank.replace(**vars(state), ctrl=ctrl.astype(state.qpos.dtype))
+            data = mjx.step(device_model, data)
+            return MjxState(**{name: getattr(data, name) for name in vars(state)})
+
+        with jax.numpy_rank_promotion("allow"):  # MJX relies on it.
+            return jax.lax.fori_loop(0, frame_skip, substep, state)
+
+    return Physics(init, step, qpos=lambda state: state.qpos, qvel=lambda state: state.qvel)
+
+
+def make_environment(task: Task, obs_noise: float = 0.0) -> Environment:
+    """`task` on MJX. See `envs.base` for the contract.
+
+    `step` clips actions to [-1, 1]. A state that is no longer finite, as after an action that is not, ends the episode
+    as `terminated`; `next_obs` is then what was computed.
+
+    Args:
+        task: what to run.
+        obs_noise: standard deviation of Gaussian noise added to every observation entry, in raw units. The physics
+            does not see it.
+
+    Raises:
+        ValueError: `obs_noise` is negative or not finite; from `step`, when traced: the action is not of shape `[A]`.
+    """
+    obs_noise = check_noise(obs_noise)
+    spec, physics = task.spec, make_physics(task.model, task.frame_skip)
+    action_shape = (spec.action_size,)
+
+    def observe(before: MjxState, after: MjxState) -> Array:
+        obs = task.observe(jnp, physics.qpos(before), physics.qpos(after), physics.qvel(after))
+        return obs.astype(jnp.float32)
+
+    def noisy(key: Key, obs: Array) -> tuple[Key, Array]:
+        if obs_noise == 0:
+            return key, obs
+        key, noise_key = jax.random.split(key)
+        return key, obs + obs_noise * jax.random.normal(noise_key, obs.shape, obs.dtype)
+
+    def reset(key: Key) -> EnvState:
+        start_key, key = jax.random.split(key)
+        state = physics.init(*task.start(start_key))
+        key, obs = noisy(key, observe(state, state))
+        return EnvState(state, obs, jnp.int32(0), key)
+
+    def step(state: EnvState, action: Array) -> tuple[EnvState, Transition]:
+        if jnp.shape(action) != action_shape:
+            raise ValueError(f"action has shape {jnp.shape(action)}. Allowed: {action_shape}.")
+        action = jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0)
+        after = physics.step(state.physics, action)
+        clean = observe(state.physics, after)
+        key, obs = noisy(state.key, clean)
+        num_steps = state.num_steps + 1
+        transition = Transition(
+            obs=state.obs,
+            action=action,
+            reward=jnp.asarray(task.reward(jnp, action, clean), jnp.float32),
+            next_obs=obs,
+            terminated=~_finite(after),
+            truncated=num_steps >= spec.episode_steps,
+        )
+        return EnvState(after, obs, num_steps, key), transition
+
+    view = View(task.model, lambda state: physics.qpos(state.physics))
+    return Environment(spec, reset, step, task.coverage, BACKEND, True, task.floor_plan, view)
+
+
+def _finite(state: MjxState) -> Array:
+    return jnp.isfinite(jnp.concatenate([state.qpos, state.qvel, state.act, state.qacc_warmstart])).all()

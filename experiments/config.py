@@ -1,0 +1,180 @@
+"""What a run is: one frozen, validated configuration, its presets, and its JSON form."""
+
+import dataclasses
+import json
+import typing
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+import envs
+from jaxplore import validate
+from jaxplore.behaviours import ImaginationConfig
+from jaxplore.beliefs import FitConfig
+from jaxplore.dynamics import DynamicsConfig
+from jaxplore.methods import METHODS, ExplorationConfig
+from jaxplore.sac import SACConfig
+from jaxplore.svgd import SVGDConfig
+from jaxplore.validate import Checks
+
+Preset = Literal["laptop", "paper", "smoke"]
+PRESETS: tuple[str, ...] = get_args(Preset)
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """One run: an environment, a method, seeds, and every setting."""
+
+    env: str = "ant_maze"
+    """Environment to explore."""
+    method: str = "implicit"
+    """How: `implicit` (the paper's) or `random` (uniform actions)."""
+    preset: Preset = "laptop"
+    """Where the other settings start from: `laptop` (10,000 steps in minutes on 2 CPU cores), `paper` (the paper's
+    numbers), `smoke` (under a minute)."""
+    seed: int = 0
+    """First seed."""
+    num_seeds: int = 1
+    """Seeds carried side by side: seed, seed + 1, ..."""
+    steps: int = 10_000
+    """Environment steps of each seed, the random ones at the start included."""
+    backend: str = "auto"
+    """Physics: `mjx` (on the device), `mujoco` (C, on the host), or `auto` (`mujoco` on a CPU, else `mjx`)."""
+    obs_noise: float = 0.0
+    """Standard deviation of Gaussian noise on each observation, raw units."""
+    checkpoint_every: int = 1_000
+    """Steps between two checkpoints."""
+    explorer: ExplorationConfig = field(default_factory=ExplorationConfig)
+
+    def __post_init__(self) -> None:
+        checks = Checks(self)
+        validate.one_of("env", self.env, envs.FACTORIES)
+        validate.one_of("method", self.method, METHODS)
+        validate.one_of("preset", self.preset, PRESETS)
+        checks.at_least("seed", 0)
+        for name in ("num_seeds", "steps", "checkpoint_every"):
+            checks.at_least(name, 1)
+        checks.in_range("obs_noise", 0.0)
+        if self.steps < self.explorer.warm_up_steps:
+            raise ValueError(
+                f"RunConfig.steps={self.steps} ends within the random steps at the start. "
+                f"Allowed: at least warm_up_steps={self.explorer.warm_up_steps}."
+            )
+
+
+LAPTOP = ExplorationConfig(
+    dynamics=DynamicsConfig(hidden=(64, 64)),
+    svgd=SVGDConfig(temperature=0.1, tempering="per_datum"),
+    fit=FitConfig(lr=1e-3, weight_decay=0.0, epochs=0, steps=60, restart=False),
+    imagination=ImaginationConfig(
+        horizon=25,
+        num_rollouts=1,
+        num_random_rollouts=0,
+        updates_per_rollout=400,
+        real_updates=0,
+        current_fraction=0.5,
+        mover="per_rollout",
+        bound=10.0,
+        replay_capacity=9_600,
+        restart=False,
+        normalize_reward=True,
+    ),
+    sac=SACConfig(hidden=(128, 128), batch_size=256, log_std_min=-5.0),
+)
+"""Settings for a laptop without a GPU: see the README for what was tried."""
+
+SMOKE = dataclasses.replace(
+    LAPTOP,
+    dynamics=DynamicsConfig(hidden=(32, 32)),
+    fit=dataclasses.replace(LAPTOP.fit, steps=10),
+    imagination=dataclasses.replace(LAPTOP.imagination, horizon=10, num_actors=32, updates_per_rollout=20),
+    sac=dataclasses.replace(LAPTOP.sac, hidden=(32, 32), batch_size=64),
+)
+"""The laptop's settings cut down until nothing can be learned: it shows that everything runs."""
+
+
+def preset_config(preset: str, env: str = "ant_maze") -> RunConfig:
+    """The configuration that a preset stands for.
+
+    Raises:
+        ValueError: unknown `preset` or `env`, naming the nearest match.
+    """
+    validate.one_of("preset", preset, PRESETS)
+    validate.one_of("env", env, envs.FACTORIES)
+    if preset == "paper":
+        return RunConfig(env=env, preset="paper", obs_noise=PAPER_OBS_NOISE.get(env, 0.0))
+    if preset == "smoke":
+        return RunConfig(env=env, preset="smoke", steps=600, checkpoint_every=200, explorer=SMOKE)
+    return RunConfig(env=env, explorer=LAPTOP)
+
+
+PAPER_OBS_NOISE = {"ant_maze": 0.02}
+"""Observation noise in nnaisense/max's commands, raw units; the paper is silent."""
+
+
+def to_json(config: Any) -> str:
+    """A configuration as indented JSON."""
+    return json.dumps(dataclasses.asdict(config), indent=2) + "\n"
+
+
+def from_json(text: str, source: str) -> RunConfig:
+    """A configuration from JSON; fields that are left out keep the defaults of the preset it names.
+
+    Args:
+        text: JSON, as `to_json` writes it.
+        source: where it came from, for messages.
+
+    Raises:
+        ValueError: not JSON, an unknown field (naming the nearest match), or a value that a field refuses.
+    """
+    try:
+        data = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{source} is not JSON: {error}.") from error
+    if not isinstance(data, dict):
+        raise ValueError(f"{source} holds {type(data).__name__}. Allowed: an object with the fields of a run.")
+    start = preset_config(data.get("preset", "laptop"), data.get("env", "ant_maze"))
+    return _replace(start, data, source)
+
+
+def _replace(config: Any, data: dict[str, Any], source: str, prefix: str = "") -> Any:
+    """`config` with the fields in `data`, nested ones too."""
+    hints = typing.get_type_hints(type(config))
+    changes = {}
+    for name, value in data.items():
+        path = f"{prefix}{name}"
+        validate.one_of(f"{source}: field", path, [f"{prefix}{known}" for known in hints])
+        current = getattr(config, name)
+        if dataclasses.is_dataclass(current):
+            if not isinstance(value, dict):
+                raise ValueError(f"{source}: {path}={value!r}. Allowed: an object.")
+            changes[name] = _replace(current, value, source, f"{path}.")
+        else:
+            changes[name] = _typed(path, value, current, source)
+    return dataclasses.replace(config, **changes)
+
+
+def _typed(path: str, value: Any, current: Any, source: str) -> Any:
+    """`value` in the type of the field's present value."""
+    if isinstance(current, tuple) and isinstance(value, list):
+        return tuple(value)
+    if isinstance(current, float) and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if type(value) is not type(current):
+        raise ValueError(f"{source}: {path}={value!r}. Allowed: a value of type {type(current).__name__}.")
+    return value
+
+
+def differences(saved: RunConfig, wanted: RunConfig) -> list[str]:
+    """The fields in which two configurations differ, as `name: saved -> wanted`."""
+
+    def walk(a: Any, b: Any, prefix: str) -> list[str]:
+        lines = []
+        for item in dataclasses.fields(a):
+            left, right = getattr(a, item.name), getattr(b, item.name)
+            if dataclasses.is_dataclass(left):
+                lines += walk(left, right, "" if item.name == "explorer" else f"{prefix}{item.name}.")
+            elif left != right:
+                lines.append(f"{prefix}{item.name}: {left!r} -> {right!r}")
+        return lines
+
+    return walk(saved, wanted, "")

@@ -1,0 +1,336 @@
+"""A run: environments step, the explorer learns, everything is logged; on one or several seeds side by side.
+
+The explorer is one jitted program over all seeds. Environments on the device are stepped by another; those on the
+host one seed after the other. All randomness follows from the seed and the step, so a run that is resumed is the run
+that was never interrupted.
+"""
+
+import functools
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+import envs
+from envs import coverage
+from envs.base import Environment
+from envs.wrappers import make_collect
+from experiments.checkpoint import Checkpoints
+from experiments.config import RunConfig
+from experiments.errors import RunError, disk_error
+from experiments.log import MetricsLog, Progress, Row, TensorBoardLog
+from jaxplore.exploration import Explorer, ExplorerState, make_explorer
+from jaxplore.methods import Sizes, get_method
+from jaxplore.types import Array, Key, Metrics, Transition
+
+INIT, RESET, COLLECT, LEARN = range(4)
+"""What a key is for; folded into the seed's key before the step."""
+
+WALK = "walk.npz"
+"""Where each step began: `positions [S, steps, 2]` [m] and `episode_steps [S, steps]`."""
+
+
+@struct.dataclass
+class RunState:
+    """All that a run carries; saved as it is. Leading axis `S` throughout."""
+
+    explorer: ExplorerState
+    env: Any
+    """Compiled environments: one `EnvState` with a leading axis. Others: a tuple of states."""
+    visited: Array
+    """Coverage cells seen, bool `[S, cells]`, NumPy."""
+    positions: Array
+    """Where each step began, from above, `[S, steps, 2]` [m], NumPy; `[S, 0, 2]` without a floor plan."""
+    episode_steps: Array
+    """The step of its episode that each step was, int32 `[S, steps]`, NumPy."""
+
+
+class Programs(NamedTuple):
+    """The functions a run calls, jitted but for the environment on a host."""
+
+    init: Callable[[], RunState]
+    collect: Callable[[RunState, int, int, bool], tuple[Any, Transition, Array]]
+    """`collect(state, step, num_steps, uniform) -> (env, transitions [S, T], valid [S, T])`."""
+    absorb: Callable[..., ExplorerState]
+    """Take transitions in; nothing is learned yet."""
+    learn: Callable[..., tuple[ExplorerState, Metrics, Array]]
+    """Assess transitions, take them in, and improve. State as before where anything came out non-finite."""
+
+
+def make_environment(config: RunConfig) -> Environment:
+    """The environment that a configuration names."""
+    return envs.make(config.env, backend=config.backend, obs_noise=config.obs_noise)
+
+
+def make_run_explorer(config: RunConfig, env: Environment) -> Explorer:
+    """The explorer that a configuration names, for its environment."""
+    return make_explorer(get_method(config.method), Sizes(env.spec.obs_size, env.spec.action_size), config.explorer)
+
+
+def make_programs(config: RunConfig, env: Environment, explorer: Explorer) -> Programs:
+    """Build the functions of a run. Nothing is compiled yet."""
+    capacity = config.explorer.steps_per_round
+    seeds = jnp.arange(config.seed, config.seed + config.num_seeds)
+    seed_keys = jax.vmap(jax.random.key)(seeds)
+    collect_one = make_collect(env, capacity)
+
+    def act(key: Key, actor: Any, obs: Array, uniform: Array) -> Array:
+        return jnp.where(uniform, explorer.act_uniformly(key, obs), explorer.act(key, actor, obs))
+
+    @jax.jit
+    def keys(purpose: int, step: int) -> Key:
+        return jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, purpose), step))(seed_keys)
+
+    def init() -> RunState:
+        reset_keys = keys(RESET, 0)
+        env_state = jax.jit(jax.vmap(env.reset))(reset_keys) if env.compiled else tuple(map(env.reset, reset_keys))
+        steps = config.steps if env.floor_plan else 0
+        return RunState(
+            explorer=jax.jit(jax.vmap(explorer.init))(keys(INIT, 0)),
+            env=env_state,
+            visited=np.zeros((config.num_seeds, env.coverage.num_cells), bool),
+            positions=np.zeros((config.num_seeds, steps, 2), np.float32),
+            episode_steps=np.zeros((config.num_seeds, steps), np.int32),
+        )
+
+    actors = jax.jit(jax.vmap(explorer.actor))
+
+    if env.compiled:
+
+        @jax.jit
+        def collect_all(keys: Key, env_state: Any, actor: Any, num_steps: Array, uniform: Array):
+            def one(key: Key, env_state: Any, actor: Any):
+                return collect_one(key, env_state, lambda k, obs: act(k, actor, obs, uniform), num_steps)
+
+            return jax.vmap(one)(keys, env_state, actor)
+    else:
+        act_on_host = jax.jit(act)
+        take = jax.jit(lambda tree, i: jax.tree.map(lambda leaf: leaf[i], tree))
+
+        def collect_all(keys: Key, env_state: Any, actor: Any, num_steps: Array, uniform: Array):
+            states, chunks = [], []
+            for i, state in enumerate(env_state):
+                own = take(actor, i)
+                state, *chunk = collect_one(
+                    keys[i], state, lambda k, obs, own=own: act_on_host(k, own, obs, uniform), int(num_steps)
+                )
+                states.append(state)
+                chunks.append(tuple(chunk))
+            return tuple(states), *jax.tree.map(lambda *leaves: np.stack(leaves), *chunks)
+
+    def collect(state: RunState, step: int, num_steps: int, uniform: bool) -> tuple[Any, Transition, Array]:
+        return collect_all(keys(COLLECT, step), state.env, actors(state.explorer), num_steps, uniform)
+
+    def learn(key: Key, state: ExplorerState, transitions: Transition, valid: Array, obs: Array, num_data: Array):
+        assess_key, improve_key = jax.random.split(key)
+        seen = explorer.assess(assess_key, state, transitions, valid)
+        after, metrics = explorer.improve(improve_key, explorer.observe(state, transitions, valid), obs, num_data)
+        finite = jnp.all(jnp.array([jnp.isfinite(value) for value in metrics.values()] or [True]))
+        kept = jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, state)
+        return kept, {**seen, **metrics}, finite
+
+    learn_all = jax.jit(jax.vmap(learn, in_axes=(0, 0, 0, 0, 0, None)), donate_argnums=1)
+
+    return Programs(
+        init=init,
+        collect=collect,
+        absorb=jax.jit(jax.vmap(explorer.observe), donate_argnums=0),
+        learn=lambda step, *args: learn_all(keys(LEARN, step), *args),
+    )
+
+
+def current_obs(env: Environment, env_state: Any) -> Array:
+    """What the agents see now, `[S, O]`."""
+    return env_state.obs if env.compiled else np.stack([state.obs for state in env_state])
+
+
+def rounds(config: RunConfig, start: int) -> Iterator[tuple[int, int]]:
+    """The steps `(first, end)` of each round from `start` on: at most `steps_per_round` long, ending with the warm-up,
+    then at each multiple of `steps_per_round`, and with the run.
+    """
+    length, warm_up = config.explorer.steps_per_round, config.explorer.warm_up_steps
+    while start < config.steps:
+        end = min(warm_up, start + length) if start < warm_up else (start // length + 1) * length
+        end = min(end, config.steps)
+        yield start, end
+        start = end
+
+
+def run(config: RunConfig, out: Path, *, env: Environment | None = None, resume: bool = False) -> RunState:
+    """Carry out a run, from its latest checkpoint if `resume`, and write its metrics, checkpoints and walk to `out`.
+
+    Args:
+        config: what to run.
+        out: the run's directory.
+        env: the environment, if the caller has made it already.
+        resume: whether to go on from the latest checkpoint; without one the run starts over.
+
+    Returns:
+        The last state.
+
+    Raises:
+        RunError: the disk fails, a checkpoint does not fit, or numbers stop being finite. The latest checkpoint is
+            then whole.
+    """
+    env = env or make_environment(config)
+    programs = make_programs(config, env, make_run_explorer(config, env))
+    checkpoints = Checkpoints(out / "checkpoints")
+    metrics = MetricsLog(out / "metrics.jsonl")
+    state, step, earlier = programs.init(), 0, 0.0
+    restored = checkpoints.restore_latest(state) if resume else None
+    if restored is not None:
+        step, state, earlier = restored.step, restored.state, restored.meta["wall_time"]
+    metrics.truncate_after(step if restored is not None else -1)
+    board = TensorBoardLog(
+        out / "tensorboard", num_seeds=config.num_seeds, after_step=None if restored is None else step
+    )
+    progress = Progress(config.steps, start_step=step, num_cells=env.coverage.num_cells)
+    if resume:
+        progress.say(f"Going on from step {step:,}." if restored else "No checkpoint yet: starting over.")
+    try:
+        state = _carry_on(config, out, env, programs, state, step, earlier, checkpoints, metrics, board, progress)
+    finally:
+        progress.close()
+        metrics.close()
+        board.close()
+    try:
+        np.savez_compressed(out / WALK, positions=state.positions, episode_steps=state.episode_steps)
+    except OSError as error:
+        raise disk_error("write the walk", out, error, "finish with --resume") from error
+    return state
+
+
+def _carry_on(
+    config: RunConfig,
+    out: Path,
+    env: Environment,
+    programs: Programs,
+    state: RunState,
+    step: int,
+    earlier: float,
+    checkpoints: Checkpoints,
+    metrics: MetricsLog,
+    board: TensorBoardLog,
+    progress: Progress,
+) -> RunState:
+    """The rounds from `step` on; `earlier` are the seconds already spent."""
+    began = time.monotonic() - earlier
+    told: set[str] = set()
+
+    def tell(what: str) -> None:
+        if what not in told:
+            told.add(what)
+            progress.say(f"Compiling the {what} step: up to a minute the first time, seconds from the cache later.")
+
+    # Positions are written in place; a restored array may be read-only.
+    state = state.replace(
+        visited=np.array(state.visited),
+        positions=np.array(state.positions),
+        episode_steps=np.array(state.episode_steps),
+    )
+    for first, end in rounds(config, step):
+        round_began = time.monotonic()
+        before = state.env
+        if env.compiled:
+            tell("environment")
+        episode_step = np.asarray(_episode_step(env, before))
+        env_state, transitions, valid = programs.collect(
+            state, first, end - first, first < config.explorer.warm_up_steps
+        )
+        if end < config.explorer.warm_up_steps:
+            told_metrics, finite = {}, np.ones(config.num_seeds, bool)
+            learned = programs.absorb(state.explorer, transitions, valid)
+        else:
+            tell("learning")
+            learned, told_metrics, finite = programs.learn(
+                first, state.explorer, transitions, valid, current_obs(env, env_state), end
+            )
+        told_metrics, finite = jax.device_get((told_metrics, finite))
+        if not np.all(finite):
+            state = state.replace(explorer=learned)
+            checkpoints.save(first, state, {"wall_time": time.monotonic() - began})
+            raise _diverged(told_metrics, finite, config, end, out)
+        transitions, valid = jax.device_get((transitions, valid))
+        _remember(env, state, transitions, valid, episode_step, first, end)
+        state = state.replace(explorer=learned, env=env_state)
+        now = time.monotonic()
+        rows = _rows(config, state, told_metrics, end, now - began, (end - first) / (now - round_began))
+        metrics.append(rows)
+        board.append(rows)
+        progress.update(end, rows)
+        if end // config.checkpoint_every > first // config.checkpoint_every or end == config.steps:
+            metrics.sync()
+            checkpoints.save(end, state, {"wall_time": time.monotonic() - began})
+    return state
+
+
+def _episode_step(env: Environment, env_state: Any) -> Array:
+    return env_state.num_steps if env.compiled else np.stack([state.num_steps for state in env_state])
+
+
+def _remember(
+    env: Environment,
+    state: RunState,
+    transitions: Transition,
+    valid: Array,
+    episode_step: Array,
+    first: int,
+    end: int,
+) -> None:
+    """Note in `state`, in place, which cells the round saw and where it went."""
+    count = end - first
+    obs = transitions.obs[:, :count]
+    state.visited[:] = _look_up(env)(state.visited, transitions.obs, valid)
+    if env.floor_plan is None:
+        return
+    state.positions[:, first:end] = obs[..., list(env.floor_plan.position)]
+    done = transitions.terminated | transitions.truncated
+    for t in range(count):
+        state.episode_steps[:, first + t] = episode_step
+        episode_step = np.where(done[:, t], 0, episode_step + 1)
+
+
+@functools.cache
+def _look_up(env: Environment) -> Callable[[Array, Array, Array], Array]:
+    """Take observations `[S, T, O]` into the cells seen, `[S, cells]`, where they are valid, `[S, T]`. Jitted once."""
+
+    def one(visited: Array, obs: Array, valid: Array) -> Array:
+        cells = jax.vmap(env.coverage.cell)(obs)
+        return coverage.update(visited, jnp.where(valid, cells, -1))
+
+    return jax.jit(jax.vmap(one))
+
+
+def _rows(config: RunConfig, state: RunState, metrics: Metrics, step: int, wall_time: float, speed: float) -> list[Row]:
+    """The round's rows, one per seed."""
+    rows = []
+    for i in range(config.num_seeds):
+        cells = int(np.sum(state.visited[i]))
+        rows.append(
+            {
+                "step": step,
+                "seed": config.seed + i,
+                "coverage": cells / state.visited.shape[1],
+                "cells": cells,
+                **{name: values[i] for name, values in metrics.items()},
+                "wall_time": round(wall_time, 3),
+                "steps_per_second": round(speed, 3),
+            }
+        )
+    return rows
+
+
+def _diverged(metrics: Metrics, finite: Array, config: RunConfig, step: int, out: Path) -> RunError:
+    """What to say of numbers that are not finite."""
+    names = [name for name, values in metrics.items() if not np.all(np.isfinite(np.asarray(values)))]
+    seeds = [str(config.seed + int(i)) for i in np.flatnonzero(~np.asarray(finite))]
+    return RunError(
+        f"{', '.join(names)} not finite in the round that ends at step {step} (seed {', '.join(seeds)}). The last good "
+        f"round is saved in {out / 'checkpoints'}. --resume would repeat this round to the bit: start again in a new "
+        "--out with a smaller --fit.lr or --sac.lr, or with --imagination.bound set."
+    )

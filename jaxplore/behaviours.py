@@ -1,0 +1,315 @@
+"""Ways to turn an intrinsic reward into behaviour.
+
+A behaviour is a named tuple of pure functions. `improve` learns from a belief and the real data, `act` gives the
+action for the real environment.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxplore import dynamics, imagination, normalizer, replay
+from jaxplore.beliefs import Belief
+from jaxplore.dynamics import Normalizers
+from jaxplore.imagination import Mover, Reward
+from jaxplore.replay import Replay
+from jaxplore.sac import Learner, SACState
+from jaxplore.types import Array, Key, Metrics, Transition
+from jaxplore.validate import Checks
+
+LABEL_CHUNK = 1024
+"""Real transitions are given their intrinsic reward this many at a time, to bound memory."""
+
+
+class Experience(NamedTuple):
+    """What a behaviour learns from in one round."""
+
+    models: Any
+    """Models drawn from the belief, fixed for the round, so that the imagined task stands still."""
+    data: Replay[Transition]
+    """All real transitions."""
+    num_data: Array
+    """How many there are, int32; the same for every seed carried side by side."""
+    normalizers: Normalizers
+    obs: Array
+    """Where the real environment stands, `[O]`."""
+
+
+class Behaviour(NamedTuple):
+    """A behaviour as pure functions."""
+
+    init: Callable[[Key], Any]
+    """`init(key) -> state`."""
+    improve: Callable[[Key, Any, Experience], tuple[Any, Metrics]]
+    """`improve(key, state, experience) -> (state, metrics)`."""
+    actor: Callable[[Any], Any]
+    """`actor(state) -> actor`: the part of the state that acting needs, small enough to hand around."""
+    act: Callable[[Key, Any, Normalizers, Array], Array]
+    """`act(key, actor, normalizers, obs [..., O]) -> action [..., A]`, for the real environment."""
+
+
+@dataclass(frozen=True)
+class ImaginationConfig:
+    """How the policy is trained in each round. The defaults are nnaisense/max's, which the paper uses."""
+
+    num_models: int = 32
+    """m, models drawn for the round. Paper: 32."""
+    num_actors: int = 128
+    """Rollouts side by side. nnaisense/max: 128."""
+    horizon: int = 50
+    """Steps of a rollout. nnaisense/max: 50."""
+    num_rollouts: int = 50
+    """Times all actors roll out, one after the other. nnaisense/max: 50."""
+    num_random_rollouts: int = 3
+    """How many of them take uniform actions and train nothing. nnaisense/max: 3."""
+    updates_per_rollout: int = 50
+    """Updates of the policy after each rollout. nnaisense/max: one per imagined step."""
+    real_updates: int = 100
+    """Updates on the real data alone, before imagining. nnaisense/max: 100."""
+    real_fraction: float = 0.0
+    """Share of each later batch that is real. 0: imagined data only (nnaisense/max); 1: real data only."""
+    current_fraction: float = 1.0
+    """Share of the actors that start where the environment stands; the others start in past states."""
+    mover: Mover = "per_step"
+    """Which model moves an actor. nnaisense/max: a random one `per_step`. Also `per_rollout`, `mean`."""
+    bound: float = 0.0
+    """Standard deviations of the real data that imagined observations and changes stay within. 0: no bound (paper)."""
+    replay_capacity: int = 320_000
+    """Imagined transitions kept. nnaisense/max makes 320,000 in a round."""
+    restart: bool = True
+    """Whether each round starts with a new policy and empty imagined data (nnaisense/max), or goes on."""
+    normalize_reward: bool = False
+    """Whether rewards are divided by their standard deviation over the imagined data. Paper: no."""
+    act_greedily: bool = True
+    """Whether the real environment gets the policy's squashed mean (nnaisense/max) or a sample."""
+
+    def __post_init__(self) -> None:
+        checks = Checks(self)
+        for field in ("num_models", "num_actors", "horizon", "num_rollouts", "updates_per_rollout", "replay_capacity"):
+            checks.at_least(field, 1)
+        for field in ("num_random_rollouts", "real_updates"):
+            checks.at_least(field, 0)
+        checks.in_range("bound", 0.0)
+        for field in ("real_fraction", "current_fraction"):
+            checks.in_range(field, 0.0, 1.0)
+        checks.one_of("mover", get_args(Mover))
+        if self.replay_capacity < self.num_actors * self.horizon:
+            raise ValueError(
+                f"replay_capacity={self.replay_capacity} does not hold one rollout. "
+                f"Allowed: at least num_actors * horizon = {self.num_actors * self.horizon}."
+            )
+
+
+@struct.dataclass
+class ImaginationState:
+    """What a policy trained in imagination carries."""
+
+    learner: SACState
+    imagined: Replay[Transition]
+
+
+def make_imagination(
+    belief: Belief, reward: Reward, learner: Learner, obs_size: int, action_size: int, config: ImaginationConfig
+) -> Behaviour:
+    """Train a learner in rollouts imagined by the belief's models (Algorithm 1, lines 7-9).
+
+    Args:
+        belief: whose models imagine; it must predict.
+        reward: the intrinsic reward.
+        learner: such as `make_sac` gives; it sees normalised observations.
+        obs_size: `O`.
+        action_size: `A`.
+        config: how much of everything.
+
+    Returns:
+        A `Behaviour`. The metrics are the learner's, from the last update, and `imagined_reward`,
+        `imagined_reward_p95` (of the last rollout, in the reward's own units) and `invalid_imagined` (share of its
+        transitions that were not finite, and dropped).
+
+    Raises:
+        ValueError: the belief does not predict.
+    """
+    predict = belief.predict
+    if predict is None:
+        raise ValueError("belief predicts nothing, so nothing can be imagined. Allowed: a belief with `predict`.")
+    flag = jnp.zeros((), bool)
+    example = Transition(jnp.zeros(obs_size), jnp.zeros(action_size), jnp.zeros(()), jnp.zeros(obs_size), flag, flag)
+
+    def init(key: Key) -> ImaginationState:
+        return ImaginationState(learner.init(key), replay.init(example, config.replay_capacity))
+
+    def act(key: Key, actor: Any, normalizers: Normalizers, obs: Array) -> Array:
+        seen = normalizer.normalize(normalizers.obs, obs)
+        return learner.act_greedily(actor, seen) if config.act_greedily else learner.act(key, actor, seen)
+
+    def label(experience: Experience) -> Replay[Transition]:
+        """The real data with the intrinsic reward that the round's models give it."""
+        data, normalizers = experience.data, experience.normalizers
+        capacity = replay.capacity(data)
+
+        def chunk(i: Array, rewards: Array) -> Array:
+            index = jnp.minimum(i * LABEL_CHUNK + jnp.arange(LABEL_CHUNK), capacity - 1)
+            rows = jax.tree.map(lambda leaf: leaf[index], data.rows)
+            prediction = predict(experience.models, dynamics.model_inputs(normalizers, rows.obs, rows.action))
+            delta = dynamics.model_targets(normalizers, rows.obs, rows.next_obs)
+            return rewards.at[index].set(reward(prediction, delta, normalizers))
+
+        num_chunks = (jnp.minimum(experience.num_data, capacity) + LABEL_CHUNK - 1) // LABEL_CHUNK
+        rewards = jax.lax.fori_loop(0, num_chunks, chunk, jnp.zeros(capacity))
+        return data.replace(rows=data.rows._replace(reward=rewards))
+
+    def train(
+        key: Key,
+        state: SACState,
+        draw: Callable[[Key], Transition],
+        normalizers: Normalizers,
+        reward_std: Array,
+        num_updates: int | Array,
+        metrics: Metrics,
+    ) -> tuple[SACState, Metrics]:
+        """`num_updates` updates, which may be a traced number, on batches that `draw` gives."""
+
+        def one_update(i: Array, carry: tuple[SACState, Metrics]) -> tuple[SACState, Metrics]:
+            draw_key, update_key = jax.random.split(jax.random.fold_in(key, i))
+            batch = draw(draw_key)
+            batch = batch._replace(
+                obs=normalizer.normalize(normalizers.obs, batch.obs),
+                next_obs=normalizer.normalize(normalizers.obs, batch.next_obs),
+                reward=batch.reward / reward_std,
+            )
+            return learner.update(update_key, carry[0], batch)
+
+        return jax.lax.fori_loop(0, num_updates, one_update, (state, metrics))
+
+    def starts(key: Key, experience: Experience) -> Array:
+        """Where the actors start, `[N, O]`."""
+        num_current = round(config.current_fraction * config.num_actors)
+        past = replay.sample(key, experience.data, config.num_actors).obs
+        current = (jnp.arange(config.num_actors) < num_current)[:, None]
+        return jnp.where(current, experience.obs[None], past)
+
+    def mixed_draw(imagined: Replay[Transition], real: Replay[Transition]) -> Callable[[Key], Transition]:
+        num_real = round(config.real_fraction * learner.batch_size)
+
+        def draw(key: Key) -> Transition:
+            if num_real == 0:
+                return replay.sample(key, imagined, learner.batch_size)
+            if num_real == learner.batch_size:
+                return replay.sample(key, real, learner.batch_size)
+            real_key, imagined_key = jax.random.split(key)
+            parts = (
+                replay.sample(real_key, real, num_real),
+                replay.sample(imagined_key, imagined, learner.batch_size - num_real),
+            )
+            return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *parts)
+
+        return draw
+
+    def improve(key: Key, state: ImaginationState, experience: Experience) -> tuple[ImaginationState, Metrics]:
+        init_key, real_key, rollouts_key = jax.random.split(key, 3)
+        normalizers = experience.normalizers
+        if config.restart:
+            state = init(init_key)
+        needs_real = config.real_updates > 0 or config.real_fraction > 0
+        real = label(experience) if needs_real else experience.data
+        learner_state, metrics = state.learner, _no_metrics(learner, obs_size, action_size)
+        if config.real_updates > 0:
+            learner_state, metrics = train(
+                real_key,
+                learner_state,
+                lambda draw_key: replay.sample(draw_key, real, learner.batch_size),
+                normalizers,
+                _reward_std(real, config.normalize_reward),
+                config.real_updates,
+                metrics,
+            )
+
+        def one_rollout(i: Array, carry):
+            learner_state, imagined, metrics, _ = carry
+            start_key, rollout_key, train_key = jax.random.split(jax.random.fold_in(rollouts_key, i), 3)
+            is_random = i < config.num_random_rollouts
+            actor = learner.actor(learner_state)
+
+            def imagined_act(act_key: Key, obs: Array) -> Array:
+                drawn = learner.act(act_key, actor, normalizer.normalize(normalizers.obs, obs))
+                return jnp.where(is_random, jax.random.uniform(act_key, drawn.shape, minval=-1.0, maxval=1.0), drawn)
+
+            rows = imagination.rollout(
+                rollout_key,
+                imagined_act,
+                predict,
+                reward,
+                experience.models,
+                normalizers,
+                starts(start_key, experience),
+                config.horizon,
+                config.mover,
+                config.bound,
+            )
+            rows = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), rows)
+            finite = jnp.isfinite(rows.reward) & jnp.all(jnp.isfinite(rows.next_obs), axis=-1)
+            imagined = replay.add(imagined, rows, finite)
+            learner_state, metrics = train(
+                train_key,
+                learner_state,
+                mixed_draw(imagined, real),
+                normalizers,
+                _reward_std(imagined, config.normalize_reward),
+                jnp.where(is_random, 0, config.updates_per_rollout),
+                metrics,
+            )
+            rewards = jnp.where(finite, rows.reward, jnp.nan)
+            seen = {
+                "imagined_reward": jnp.nanmean(rewards),
+                "imagined_reward_p95": jnp.nanpercentile(rewards, 95.0),
+                "invalid_imagined": jnp.mean(~finite),
+            }
+            return learner_state, imagined, metrics, seen
+
+        nothing = jnp.zeros(())
+        seen = {"imagined_reward": nothing, "imagined_reward_p95": nothing, "invalid_imagined": nothing}
+        learner_state, imagined, metrics, seen = jax.lax.fori_loop(
+            0, config.num_rollouts, one_rollout, (learner_state, state.imagined, metrics, seen)
+        )
+        return ImaginationState(learner_state, imagined), {**metrics, **seen}
+
+    return Behaviour(init, improve, lambda state: learner.actor(state.learner), act)
+
+
+def _no_metrics(learner: Learner, obs_size: int, action_size: int) -> Metrics:
+    """Zeros in the shape of the learner's metrics, to start a loop with."""
+    flag = jax.ShapeDtypeStruct((1,), jnp.bool_)
+    obs, scalar = jax.ShapeDtypeStruct((1, obs_size), jnp.float32), jax.ShapeDtypeStruct((1,), jnp.float32)
+    batch = Transition(obs, jax.ShapeDtypeStruct((1, action_size), jnp.float32), scalar, obs, flag, flag)
+    key = jax.random.key(0)
+    shapes = jax.eval_shape(lambda rows: learner.update(key, learner.init(key), rows)[1], batch)
+    return jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), shapes)
+
+
+def _reward_std(data: Replay[Transition], wanted: bool) -> Array:
+    """Standard deviation of the rewards held, at least 1e-6; 1 where rewards stay as they are."""
+    if not wanted:
+        return jnp.ones(())
+    held = jnp.arange(replay.capacity(data)) < data.size
+    count = jnp.maximum(data.size, 1)
+    rewards = jnp.where(held, data.rows.reward, 0.0)
+    mean = jnp.sum(rewards) / count
+    return jnp.maximum(jnp.sqrt(jnp.sum(jnp.where(held, rewards - mean, 0.0) ** 2) / count), 1e-6)
+
+
+def make_uniform(action_size: int) -> Behaviour:
+    """Uniform actions in [-1, 1], always."""
+
+    def act(key: Key, actor: Any, normalizers: Normalizers, obs: Array) -> Array:
+        return jax.random.uniform(key, (*obs.shape[:-1], action_size), minval=-1.0, maxval=1.0)
+
+    return Behaviour(
+        init=lambda key: (),
+        improve=lambda key, state, experience: (state, {}),
+        actor=lambda state: (),
+        act=act,
+    )

@@ -1,0 +1,167 @@
+"""A generator of networks: G(z; eta) turns Gaussian noise into the parameters of any Flax network.
+
+One small MLP per layer of the target network maps the noise z to that layer's weights and biases (section 3.1 of
+Ratzlaff et al. 2020, figure 1). The target network is given by example: any tree of parameters will do, so a
+posterior can be put over any network.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxplore.networks import MLP
+from jaxplore.types import Array, Key, Params
+from jaxplore.validate import Checks
+
+Noise = Literal["shared", "per_layer"]
+InitStd = Literal["match_example", "he", "lecun"]
+
+
+@dataclass(frozen=True)
+class GeneratorConfig:
+    """Shape and initialisation of a generator."""
+
+    noise_size: int = 32
+    """Entries of z. Paper: 32."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Widths of the hidden layers of each layer generator. Paper: 64, 64 (ReLU)."""
+    noise: Noise = "shared"
+    """`shared`: one z for all layers (main text and figure 1). `per_layer`: an independent z each (appendix)."""
+    init_std: InitStd = "match_example"
+    """Standard deviation of a sampled network's kernel entries at the start: that of the example's own entries, or
+    He's sqrt(2 / fan_in), or LeCun's sqrt(1 / fan_in)."""
+    constant_fraction: float = 0.5
+    """Share of that variance that does not depend on z, in [0, 1). 0: unrelated networks; near 1: nearly equal ones."""
+    bias_std: float = 0.1
+    """The same for entries of leaves with fewer than two axes (biases, scales), around the example's value."""
+
+    def __post_init__(self) -> None:
+        checks = Checks(self)
+        checks.at_least("noise_size", 1)
+        checks.widths("hidden")
+        checks.one_of("noise", get_args(Noise))
+        checks.one_of("init_std", get_args(InitStd))
+        checks.in_range("constant_fraction", 0.0, 1.0, open_high=True)
+        checks.in_range("bias_std", 0.0)
+
+
+class Generator(NamedTuple):
+    """Pure functions of one generator."""
+
+    init: Callable[[Key], Params]
+    """`init(key) -> eta`."""
+    sample_noise: Callable[[Key, int], Array]
+    """`sample_noise(key, num) -> z`: `[num, Z]`, or `[num, layers, Z]` where each layer has its own."""
+    generate: Callable[[Params, Array], Params]
+    """`generate(eta, z) -> theta`: one network's parameters from one z, shaped like the example."""
+    sample: Callable[[Params, Array], Params]
+    """`sample(eta, zs) -> thetas`: `generate` under `vmap` over z; every leaf gets a leading axis `M`."""
+
+
+def fan_in(leaf: Array) -> int:
+    """Inputs that feed one output of a kernel in Flax's layout `[..., in, out]`."""
+    return math.prod(leaf.shape[:-1])
+
+
+def kernel_std(leaf: Array, rule: InitStd) -> float:
+    """Standard deviation that `rule` gives the entries of a kernel."""
+    if rule == "match_example":
+        return float(np.sqrt(np.mean(np.square(np.asarray(leaf)))))
+    return math.sqrt((2.0 if rule == "he" else 1.0) / fan_in(leaf))
+
+
+def make_generator(example: Params, config: GeneratorConfig | None = None) -> Generator:
+    """Make a generator of networks with parameters shaped like `example`.
+
+    Args:
+        example: the parameter tree of one network, freshly initialised. Leaves that share a parent (a layer's kernel
+            and bias) come from one layer generator.
+        config: shape and initialisation; the paper's by default.
+
+    Returns:
+        A `Generator`.
+
+    Raises:
+        ValueError: `example` has no leaves, or `init_std="match_example"` and a kernel of it is all zeros.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> net = MLP(hidden=(64,), output_size=2)
+        >>> example = net.init(jax.random.key(0), jnp.zeros(3))["params"]
+        >>> generator = make_generator(example)
+        >>> eta = generator.init(jax.random.key(1))
+        >>> thetas = generator.sample(eta, generator.sample_noise(jax.random.key(2), 32))
+        >>> jax.vmap(lambda theta: net.apply({"params": theta}, jnp.ones(3)))(thetas).shape
+        (32, 2)
+    """
+    config = config or GeneratorConfig()
+    paths_and_leaves, treedef = jax.tree_util.tree_flatten_with_path(example)
+    if not paths_and_leaves:
+        raise ValueError("example has no leaves. Allowed: a tree with at least one parameter array.")
+    layers: dict[str, list[int]] = {}
+    for index, (path, _) in enumerate(paths_and_leaves):
+        layers.setdefault(jax.tree_util.keystr(path[:-1], simple=True, separator="/") or "root", []).append(index)
+    leaves = [leaf for _, leaf in paths_and_leaves]
+    sizes = {name: sum(leaves[i].size for i in indices) for name, indices in layers.items()}
+    networks = {name: MLP(config.hidden, size, "relu", "he") for name, size in sizes.items()}
+    centre, std = {}, {}
+    for name, indices in layers.items():
+        centre[name], std[name] = _targets([(paths_and_leaves[i][0], leaves[i]) for i in indices], config)
+
+    def init(key: Key) -> Params:
+        eta = {}
+        for name, layer_key in zip(networks, jax.random.split(key, len(networks)), strict=True):
+            hidden_key, kernel_key, bias_key = jax.random.split(layer_key, 3)
+            params = networks[name].init(hidden_key, jnp.zeros(config.noise_size))["params"]
+            # With He's initialisation the features entering the last layer have mean square 1, so their sum over
+            # `width` entries of variance v / width has variance v.
+            width, size = config.hidden[-1], sizes[name]
+            kernel_scale = math.sqrt((1.0 - config.constant_fraction) / width)
+            constant = math.sqrt(config.constant_fraction) * jax.random.normal(bias_key, (size,))
+            params["output"] = {
+                "kernel": kernel_scale * std[name][None, :] * jax.random.normal(kernel_key, (width, size)),
+                "bias": centre[name] + std[name] * constant,
+            }
+            eta[name] = params
+        return eta
+
+    def sample_noise(key: Key, num: int) -> Array:
+        shape = (num, config.noise_size) if config.noise == "shared" else (num, len(layers), config.noise_size)
+        return jax.random.normal(key, shape)
+
+    def generate(eta: Params, z: Array) -> Params:
+        generated: list[Array | None] = [None] * len(leaves)
+        for number, (name, indices) in enumerate(layers.items()):
+            flat = networks[name].apply({"params": eta[name]}, z if config.noise == "shared" else z[number])
+            offset = 0
+            for i in indices:
+                generated[i] = flat[offset : offset + leaves[i].size].reshape(leaves[i].shape)
+                offset += leaves[i].size
+        return jax.tree.unflatten(treedef, generated)
+
+    return Generator(init, sample_noise, generate, jax.vmap(generate, in_axes=(None, 0)))
+
+
+def _targets(layer: list, config: GeneratorConfig) -> tuple[Array, Array]:
+    """Mean and standard deviation that each generated number of a layer starts with, over networks and inits."""
+    centres, stds = [], []
+    for path, leaf in layer:
+        if leaf.ndim < 2:
+            centres.append(np.ravel(np.asarray(leaf)))
+            stds.append(np.full(leaf.size, config.bias_std))
+            continue
+        std = kernel_std(leaf, config.init_std)
+        if std == 0.0:
+            name = jax.tree_util.keystr(path)
+            raise ValueError(
+                f"example{name} is all zeros, so its spread cannot be matched. "
+                "Allowed: an initialised network, or init_std='he' or 'lecun'."
+            )
+        centres.append(np.zeros(leaf.size))
+        stds.append(np.full(leaf.size, std))
+    return jnp.asarray(np.concatenate(centres), jnp.float32), jnp.asarray(np.concatenate(stds), jnp.float32)

@@ -1,0 +1,120 @@
+"""The methods table: a method is a belief, an intrinsic reward, and a way to turn the reward into behaviour.
+
+Everything else is shared. To add a method, add a row; what it needs and nothing here offers is one new factory.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple, get_args
+
+from jaxplore import behaviours, beliefs, rewards, validate
+from jaxplore.behaviours import Behaviour, ImaginationConfig
+from jaxplore.beliefs import Belief, FitConfig
+from jaxplore.dynamics import DynamicsConfig
+from jaxplore.generator import GeneratorConfig
+from jaxplore.imagination import Reward
+from jaxplore.sac import SACConfig, make_sac
+from jaxplore.svgd import SVGDConfig
+from jaxplore.validate import Checks
+
+RewardUnits = Literal["normalized", "raw"]
+
+
+@dataclass(frozen=True)
+class ExplorationConfig:
+    """Every setting of a method and of the loop around it. The defaults are the paper's."""
+
+    warm_up_steps: int = 256
+    """Uniform random actions before the first round. nnaisense/max: 256."""
+    steps_per_round: int = 25
+    """Real steps between two rounds. nnaisense/max: 25."""
+    data_capacity: int = 10_001
+    """Real transitions kept. nnaisense/max: the number of steps, plus one."""
+    reward_units: RewardUnits = "normalized"
+    """Units of the variance reward: normalised delta, or the observation's own (`raw`)."""
+    dynamics: DynamicsConfig = field(default_factory=DynamicsConfig)
+    generator: GeneratorConfig = field(default_factory=GeneratorConfig)
+    svgd: SVGDConfig = field(default_factory=SVGDConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    imagination: ImaginationConfig = field(default_factory=ImaginationConfig)
+    sac: SACConfig = field(default_factory=SACConfig)
+
+    def __post_init__(self) -> None:
+        checks = Checks(self)
+        for name in ("warm_up_steps", "steps_per_round"):
+            checks.at_least(name, 1)
+        checks.at_least("data_capacity", self.steps_per_round)
+        checks.one_of("reward_units", get_args(RewardUnits))
+
+
+class Sizes(NamedTuple):
+    """What a method must know of an environment."""
+
+    obs: int
+    action: int
+
+
+class Method(NamedTuple):
+    """One row of the table. Each entry makes its part from the configuration."""
+
+    summary: str
+    """What it is, for `--help` and tables."""
+    belief: Callable[[Sizes, ExplorationConfig], Belief]
+    reward: Callable[[ExplorationConfig], Reward]
+    behaviour: Callable[[Sizes, ExplorationConfig, Belief, Reward], Behaviour]
+
+
+def generator_belief(sizes: Sizes, config: ExplorationConfig) -> Belief:
+    """The generator of dynamics networks, trained by amortised SVGD."""
+    return beliefs.make_generator_belief(
+        sizes.obs, sizes.action, config.dynamics, config.generator, config.svgd, config.fit
+    )
+
+
+def no_belief(sizes: Sizes, config: ExplorationConfig) -> Belief:
+    """No model of the environment."""
+    return beliefs.make_no_belief()
+
+
+def variance_reward(config: ExplorationConfig) -> Reward:
+    """Equation 1, in the units that the configuration names."""
+    raw = config.reward_units == "raw"
+    return lambda prediction, delta, normalizers: rewards.variance(prediction, normalizers.delta.std if raw else None)
+
+
+def no_reward(config: ExplorationConfig) -> Reward:
+    """Zero."""
+    return lambda prediction, delta, normalizers: 0.0 * delta[..., 0]
+
+
+def sac_in_imagination(sizes: Sizes, config: ExplorationConfig, belief: Belief, reward: Reward) -> Behaviour:
+    """SAC, trained in rollouts that the belief's models imagine."""
+    sac = make_sac(sizes.obs, sizes.action, config.sac)
+    return behaviours.make_imagination(belief, reward, sac, sizes.obs, sizes.action, config.imagination)
+
+
+def uniform_actions(sizes: Sizes, config: ExplorationConfig, belief: Belief, reward: Reward) -> Behaviour:
+    """Uniform random actions."""
+    return behaviours.make_uniform(sizes.action)
+
+
+METHODS: dict[str, Method] = {
+    "implicit": Method(
+        "generator of models trained by amortised SVGD, variance reward, SAC in imagination",
+        generator_belief,
+        variance_reward,
+        sac_in_imagination,
+    ),
+    "random": Method("uniform random actions", no_belief, no_reward, uniform_actions),
+}
+"""Name -> method. Add your own with `METHODS["mine"] = Method(...)`."""
+
+
+def get_method(name: str) -> Method:
+    """The method called `name`.
+
+    Raises:
+        ValueError: no such method; names the nearest and lists all.
+    """
+    validate.one_of("method", name, METHODS)
+    return METHODS[name]

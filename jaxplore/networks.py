@@ -1,0 +1,132 @@
+"""The networks: a plain MLP, value heads and the tanh-Gaussian policy. The only file that knows linen and distrax.
+
+Every network is unbatched-friendly: leading axes of the input pass through.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import distrax
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from jaxplore import validate
+from jaxplore.types import Array, Key
+
+ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
+    "relu": nn.relu,
+    "leaky_relu": nn.leaky_relu,
+    "swish": nn.swish,
+    "tanh": jnp.tanh,
+}
+"""Activations by name. `leaky_relu` has slope 0.01; `swish` is x * sigmoid(x)."""
+
+INITIALIZERS = {
+    "he": nn.initializers.he_normal,
+    "lecun": nn.initializers.lecun_normal,
+    "orthogonal": nn.initializers.orthogonal,
+    "xavier": nn.initializers.xavier_uniform,
+}
+"""Kernel initialisers by name; biases start at 0."""
+
+
+class MLP(nn.Module):
+    """A multi-layer perceptron with a linear last layer: `[..., I] -> [..., output_size]`.
+
+    Raises:
+        ValueError: unknown `activation` or `init`, naming the nearest match.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> net = MLP(hidden=(64, 64), output_size=3)
+        >>> params = net.init(jax.random.key(0), jnp.zeros(5))["params"]
+        >>> net.apply({"params": params}, jnp.ones((7, 5))).shape
+        (7, 3)
+    """
+
+    hidden: tuple[int, ...]
+    output_size: int
+    activation: str = "relu"
+    init_name: str = "he"
+    """Initialiser of the hidden layers."""
+    output_init_name: str = "lecun"
+    """Initialiser of the last layer, which no activation follows."""
+
+    def __post_init__(self) -> None:
+        validate.one_of("activation", self.activation, ACTIVATIONS)
+        validate.one_of("init_name", self.init_name, INITIALIZERS)
+        validate.one_of("output_init_name", self.output_init_name, INITIALIZERS)
+        super().__post_init__()
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        """Run the network."""
+        for i, width in enumerate(self.hidden):
+            x = nn.Dense(width, kernel_init=INITIALIZERS[self.init_name](), name=f"hidden_{i}")(x)
+            x = ACTIVATIONS[self.activation](x)
+        return nn.Dense(self.output_size, kernel_init=INITIALIZERS[self.output_init_name](), name="output")(x)
+
+
+class GaussianParams(NamedTuple):
+    """A diagonal Gaussian before the squash."""
+
+    mean: Array
+    """`[..., A]`"""
+    log_std: Array
+    """`[..., A]`"""
+
+
+class TanhGaussianPolicy(nn.Module):
+    """Network of a tanh-squashed diagonal Gaussian policy: `[..., O] -> GaussianParams` of `[..., A]`.
+
+    The log standard deviation is a smooth function of its head, `low + (high - low) / 2 * (tanh(head) + 1)`, so that
+    it stays in `log_std_bounds` with a gradient everywhere (nnaisense/max, `sac.py`).
+    """
+
+    hidden: tuple[int, ...]
+    action_size: int
+    activation: str = "leaky_relu"
+    init_name: str = "orthogonal"
+    log_std_bounds: tuple[float, float] = (-20.0, 2.0)
+
+    @nn.compact
+    def __call__(self, obs: Array) -> GaussianParams:
+        """Run the network."""
+        heads = MLP(self.hidden, 2 * self.action_size, self.activation, self.init_name, self.init_name, name="mlp")(obs)
+        mean, head = jnp.split(heads, 2, axis=-1)
+        low, high = self.log_std_bounds
+        return GaussianParams(mean, low + 0.5 * (high - low) * (jnp.tanh(head) + 1.0))
+
+
+def sample_tanh_gaussian(key: Key, params: GaussianParams) -> tuple[Array, Array]:
+    """Draw an action and its log-density.
+
+    The pair comes out of one pass: a density recomputed from a saturated action is not finite (distrax issue 7).
+
+    Args:
+        key: consumed.
+        params: mean and log standard deviation before the squash, each `[..., A]`.
+
+    Returns:
+        `(action [..., A] in [-1, 1], log_prob [...])`. The gradient flows through both (reparametrised).
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> action, log_prob = sample_tanh_gaussian(jax.random.key(0), GaussianParams(jnp.zeros(2), jnp.zeros(2)))
+        >>> action.shape, log_prob.shape
+        ((2,), ())
+    """
+    gaussian = distrax.MultivariateNormalDiag(params.mean, jnp.exp(params.log_std))
+    squashed = distrax.Transformed(gaussian, distrax.Block(distrax.Tanh(), 1))
+    return squashed.sample_and_log_prob(seed=key)
+
+
+def tanh_mean(params: GaussianParams) -> Array:
+    """The deterministic action `[..., A]`: the squashed mean of the Gaussian (not the mean of the squashed one)."""
+    return jnp.tanh(params.mean)
+
+
+def count_params(params: object) -> int:
+    """How many numbers a parameter tree holds."""
+    return sum(leaf.size for leaf in jax.tree.leaves(params))

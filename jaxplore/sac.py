@@ -1,0 +1,192 @@
+"""Soft actor-critic in its first form: a policy, two action-value networks, a value network and its slow copy.
+
+Haarnoja et al. (2018), arXiv 1801.01290, with the settings that Ratzlaff et al. (2020) use for exploration (table
+"List of SAC hyper-parameters", after nnaisense/max): fixed entropy weight alpha, leaky ReLU, orthogonal weights.
+Pure functions; the caller normalises observations.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from jaxplore.networks import (
+    ACTIVATIONS,
+    INITIALIZERS,
+    MLP,
+    TanhGaussianPolicy,
+    sample_tanh_gaussian,
+    tanh_mean,
+)
+from jaxplore.types import Array, Key, Metrics, Params, Transition
+from jaxplore.validate import Checks
+
+
+@dataclass(frozen=True)
+class SACConfig:
+    """Settings of SAC. The defaults are the paper's for exploration."""
+
+    hidden: tuple[int, ...] = (256, 256)
+    """Hidden widths of every network. Paper: 256, 256."""
+    activation: str = "leaky_relu"
+    """nnaisense/max: leaky ReLU, slope 0.01."""
+    init: str = "orthogonal"
+    """Initialiser of every layer. nnaisense/max: orthogonal, gain 1."""
+    lr: float = 1e-3
+    """Adam's learning rate for all networks. Paper: 1e-3."""
+    batch_size: int = 4096
+    """Transitions per update. Paper: 4096."""
+    alpha: float = 0.02
+    """Weight of the entropy beside the reward. Paper: 0.02."""
+    discount: float = 0.99
+    """gamma per step. Paper: 0.99."""
+    tau: float = 5e-3
+    """Step of the slow value network towards the value network at each update. Paper: 5e-3."""
+    reward_scale: float = 1.0
+    """Factor on the reward. Paper: 1."""
+    log_std_min: float = -20.0
+    """Lower end of the policy's log standard deviation. nnaisense/max: -20."""
+    log_std_max: float = 2.0
+    """Upper end. nnaisense/max: 2."""
+    policy_penalty: float = 1e-3
+    """Weight of mean(tanh(mean)^2) + mean(log_std^2) in the policy's loss. nnaisense/max: 1e-3."""
+    grad_clip: float = 5.0
+    """Bound on each entry of a gradient. nnaisense/max: 5."""
+
+    def __post_init__(self) -> None:
+        checks = Checks(self)
+        checks.widths("hidden")
+        checks.one_of("activation", ACTIVATIONS)
+        checks.one_of("init", INITIALIZERS)
+        for field in ("lr", "reward_scale", "grad_clip"):
+            checks.in_range(field, 0.0, open_low=True)
+        checks.at_least("batch_size", 1)
+        checks.in_range("alpha", 0.0)
+        checks.in_range("discount", 0.0, 1.0)
+        checks.in_range("tau", 0.0, 1.0, open_low=True)
+        checks.in_range("policy_penalty", 0.0)
+        checks.in_range("log_std_min", high=self.log_std_max)
+        checks.in_range("log_std_max", self.log_std_min, 10.0)
+
+
+@struct.dataclass
+class SACState:
+    """What SAC carries."""
+
+    params: Params
+    """`{"policy", "q", "v"}`; the leaves of `q` have a leading axis of 2."""
+    target_v: Params
+    """Slow copy of the value network."""
+    opt_state: optax.OptState
+
+
+class Learner(NamedTuple):
+    """A learner of behaviour as pure functions."""
+
+    init: Callable[[Key], SACState]
+    """`init(key) -> state`."""
+    actor: Callable[[SACState], Params]
+    """`actor(state) -> actor`: the part of the state that acting needs."""
+    act: Callable[[Key, Params, Array], Array]
+    """`act(key, actor, obs [..., O]) -> action [..., A]`, drawn from the policy."""
+    act_greedily: Callable[[Params, Array], Array]
+    """`act_greedily(actor, obs [..., O]) -> action [..., A]`, the squashed mean."""
+    update: Callable[[Key, SACState, Transition], tuple[SACState, Metrics]]
+    """`update(key, state, batch [B, ...]) -> (state, metrics)`, one gradient step of every network."""
+    batch_size: int
+    """Transitions that an update expects, `B`."""
+
+
+def make_sac(obs_size: int, action_size: int, config: SACConfig | None = None) -> Learner:
+    """Make the learner.
+
+    Args:
+        obs_size: `O`.
+        action_size: `A`, each entry of an action in [-1, 1].
+        config: the paper's exploration settings by default.
+
+    Returns:
+        A `Learner`. The metrics of `update` are `q_loss`, `v_loss`, `policy_loss`, `q` (mean value of the batch) and
+        `entropy` (of the policy on the batch, nats).
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> sac = make_sac(3, 1, SACConfig(hidden=(32, 32), batch_size=8))
+        >>> state = sac.init(jax.random.key(0))
+        >>> obs, flag = jnp.ones((8, 3)), jnp.zeros(8, bool)
+        >>> batch = Transition(obs, jnp.zeros((8, 1)), jnp.ones(8), obs, flag, flag)
+        >>> state, metrics = sac.update(jax.random.key(1), state, batch)
+        >>> sac.act_greedily(sac.actor(state), obs[0]).shape
+        (1,)
+    """
+    config = config or SACConfig()
+    log_std_bounds = (config.log_std_min, config.log_std_max)
+    policy = TanhGaussianPolicy(config.hidden, action_size, config.activation, config.init, log_std_bounds)
+    value = MLP(config.hidden, 1, config.activation, config.init, config.init)
+    optimizer = optax.chain(optax.clip(config.grad_clip), optax.adam(config.lr))
+
+    def apply_q(params: Params, obs: Array, action: Array) -> Array:
+        """Both action values, `[2, B]`."""
+        inputs = jnp.concatenate([obs, action], axis=-1)
+        return jax.vmap(lambda one: value.apply({"params": one}, inputs)[..., 0])(params)
+
+    def apply_v(params: Params, obs: Array) -> Array:
+        return value.apply({"params": params}, obs)[..., 0]
+
+    def apply_policy(params: Params, obs: Array):
+        return policy.apply({"params": params}, obs)
+
+    def init(key: Key) -> SACState:
+        policy_key, q_key, v_key = jax.random.split(key, 3)
+        obs, inputs = jnp.zeros(obs_size), jnp.zeros(obs_size + action_size)
+        params = {
+            "policy": policy.init(policy_key, obs)["params"],
+            "q": jax.vmap(lambda one: value.init(one, inputs)["params"])(jax.random.split(q_key, 2)),
+            "v": value.init(v_key, obs)["params"],
+        }
+        return SACState(params, jax.tree.map(jnp.copy, params["v"]), optimizer.init(params))
+
+    def actor(state: SACState) -> Params:
+        return state.params["policy"]
+
+    def act(key: Key, actor: Params, obs: Array) -> Array:
+        return sample_tanh_gaussian(key, apply_policy(actor, obs))[0]
+
+    def act_greedily(actor: Params, obs: Array) -> Array:
+        return tanh_mean(apply_policy(actor, obs))
+
+    def loss(params: Params, key: Key, target_v: Params, batch: Transition) -> tuple[Array, Metrics]:
+        gaussian = apply_policy(params["policy"], batch.obs)
+        action, log_prob = sample_tanh_gaussian(key, gaussian)
+        # The networks share no parameters, so the gradient of the sum is each network's own.
+        q_of_policy = jnp.min(apply_q(jax.lax.stop_gradient(params["q"]), batch.obs, action), axis=0)
+        penalty = jnp.mean(tanh_mean(gaussian) ** 2) + jnp.mean(gaussian.log_std**2)
+        policy_loss = jnp.mean(config.alpha * log_prob - q_of_policy) + config.policy_penalty * penalty
+
+        next_v = apply_v(target_v, batch.next_obs)
+        q_target = config.reward_scale * batch.reward + config.discount * jnp.where(batch.terminated, 0.0, next_v)
+        q = apply_q(params["q"], batch.obs, batch.action)
+        q_loss = 0.5 * jnp.sum(jnp.mean((q - jax.lax.stop_gradient(q_target)[None]) ** 2, axis=1))
+        v_target = jax.lax.stop_gradient(q_of_policy - config.alpha * log_prob)
+        v_loss = 0.5 * jnp.mean((apply_v(params["v"], batch.obs) - v_target) ** 2)
+        metrics = {
+            "q_loss": q_loss,
+            "v_loss": v_loss,
+            "policy_loss": policy_loss,
+            "q": jnp.mean(q),
+            "entropy": -jnp.mean(log_prob),
+        }
+        return policy_loss + q_loss + v_loss, metrics
+
+    def update(key: Key, state: SACState, batch: Transition) -> tuple[SACState, Metrics]:
+        gradient, metrics = jax.grad(loss, has_aux=True)(state.params, key, state.target_v, batch)
+        steps, opt_state = optimizer.update(gradient, state.opt_state, state.params)
+        params = optax.apply_updates(state.params, steps)
+        target_v = optax.incremental_update(params["v"], state.target_v, config.tau)
+        return SACState(params, target_v, opt_state), metrics
+
+    return Learner(init, actor, act, act_greedily, update, config.batch_size)

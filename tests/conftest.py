@@ -1,0 +1,32 @@
+"""What holds for every test: no silent rank promotion, two CPU devices, compiled programs kept between runs.
+
+Warnings are errors too; `pyproject.toml` says so, and which of other packages' warnings are let through.
+"""
+
+import os
+from pathlib import Path
+
+# Read by JAX when it is imported, and inherited by the commands that tests start.
+_CACHE = Path(__file__).parent.parent / ".cache" / "jax"
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
+
+import jax
+import pytest
+
+# Not through the environment: a command under test should see the devices that a user's command sees.
+jax.config.update("jax_num_cpu_devices", 2)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    if item.get_closest_marker("gpu") and not _has_gpu():
+        pytest.skip("there is no GPU")
+
+
+def _has_gpu() -> bool:
+    try:
+        return bool(jax.devices("gpu"))
+    except RuntimeError:
+        return False

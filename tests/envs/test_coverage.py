@@ -1,0 +1,88 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from envs import coverage
+from envs.ant_maze import CELLS, POSITION, SPEC
+from envs.base import Coverage
+
+MAZE = coverage.make_box_coverage(POSITION, CELLS, "maze cells")
+CENTRES = [(0, 0), (2, 0), (4, 0), (4, 2), (4, 4), (2, 4), (0, 4)]
+
+
+def obs_at(points) -> jax.Array:
+    """Observations `[T, 31]` whose x and y are `points`."""
+    points = jnp.asarray(points, jnp.float32)
+    return jnp.full((len(points), SPEC.obs_size), 9.0).at[:, 2:4].set(points)
+
+
+@pytest.mark.parametrize(("index", "centre"), list(enumerate(CENTRES)))
+def test_cells_are_numbered_from_the_start_along_the_corridor(index, centre):
+    assert MAZE.cell(obs_at([centre])[0]) == index
+
+
+@pytest.mark.parametrize(
+    ("point", "cell"),
+    [
+        ((-0.999, -0.999), 0),
+        ((0.999, 0.999), 0),
+        ((1.0, 0.0), 1),  # the lower border belongs to the cell
+        ((3.0, 0.999), 2),
+        ((3.0, 1.0), 3),
+        ((4.999, 4.999), 4),
+        ((2.999, 1.5), -1),  # the wall between the arms
+        ((0.0, 2.0), -1),
+        ((5.0, 0.0), -1),
+        ((0.0, -1.001), -1),
+        ((np.nan, 0.0), -1),
+        ((np.inf, 0.0), -1),
+    ],
+)
+def test_borders_lie_at_minus_1_1_3_and_5(point, cell):
+    assert MAZE.cell(obs_at([point])[0]) == cell
+
+
+def test_cell_is_int32_under_jit_and_vmap():
+    cells = jax.jit(jax.vmap(MAZE.cell))(obs_at(CENTRES))
+    assert cells.dtype == jnp.int32
+    np.testing.assert_array_equal(cells, range(7))
+
+
+def test_scripted_path_counts_each_cell_once():
+    path = obs_at([(0, 0), (0.5, 0.5), (2, 0), (0, 0), (2, 2), (4, 0), (4, 2), (9, 9)])
+    visited, fractions = coverage.init(MAZE), []
+    for obs in path:
+        visited = coverage.update_from_obs(MAZE, visited, obs)
+        fractions.append(float(coverage.fraction(visited)))
+    np.testing.assert_allclose(fractions, np.array([1, 1, 2, 2, 2, 3, 4, 4]) / 7, rtol=1e-6)
+    np.testing.assert_array_equal(visited, [True, True, True, True, False, False, False])
+
+
+def test_a_batch_counts_as_its_observations_one_by_one():
+    key = jax.random.key(0)
+    batch = obs_at(jax.random.uniform(key, (60, 2), minval=-3.0, maxval=7.0))
+    one_by_one = coverage.init(MAZE)
+    for obs in batch:
+        one_by_one = coverage.update(one_by_one, MAZE.cell(obs))
+    at_once = jax.jit(lambda obs: coverage.update_from_obs(MAZE, coverage.init(MAZE), obs))(batch.reshape(6, 10, -1))
+    np.testing.assert_array_equal(at_once, one_by_one)
+
+
+def test_outside_marks_nothing_and_no_cell_is_ever_forgotten():
+    visited = coverage.update(coverage.init(MAZE), jnp.array([6]))
+    np.testing.assert_array_equal(coverage.update(visited, jnp.array([-1, -1])), visited)
+
+
+def test_nothing_seen_is_0_and_everything_seen_is_1():
+    small = Coverage(3, lambda obs: jnp.int32(0), "cells")
+    visited = coverage.init(small)
+    assert visited.shape == (3,)
+    assert visited.dtype == bool
+    assert coverage.fraction(visited) == 0
+    assert coverage.fraction(coverage.update(visited, jnp.arange(3))) == 1
+
+
+def test_full_tour_of_the_corridor_is_7_of_7():
+    visited = coverage.update_from_obs(MAZE, coverage.init(MAZE), obs_at(CENTRES))
+    assert coverage.fraction(visited) == 1
