@@ -87,8 +87,8 @@ class FloorPlan(NamedTuple):
 class View(NamedTuple):
     """What drawing an environment takes."""
 
-    model: "mujoco.MjModel"
-    """With cameras "track" and "overview"."""
+    model: Any
+    """A `mujoco.MjModel`, with cameras "track" and "overview"."""
     qpos: Callable[[EnvState], Array]
     """`qpos(state) -> [nq]`: the model's positions in a state."""
 

@@ -75,7 +75,7 @@ def _collect_host(
         transitions.append(transition)
         if transition.terminated or transition.truncated:
             env_state = env.reset(reset_key)
-    transitions += [jax.tree.map(np.zeros_like, transition)] * (capacity - num_steps)
+    transitions += [jax.tree.map(np.zeros_like, transitions[-1])] * (capacity - num_steps)
     rows = jax.tree.map(lambda *leaves: np.stack(leaves), *transitions)
     finite = np.all(np.isfinite(rows.obs) & np.isfinite(rows.next_obs), axis=-1)
     return env_state, rows, finite & (np.arange(capacity) < num_steps)

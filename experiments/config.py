@@ -2,7 +2,8 @@
 
 import dataclasses
 import json
-import typing
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, get_args
 
@@ -75,7 +76,7 @@ LAPTOP = ExplorationConfig(
         mover="per_rollout",
         bound=10.0,
         replay_capacity=9_600,
-        restart=False,
+        restart_every=12,
         normalize_reward=True,
     ),
     sac=SACConfig(hidden=(128, 128), batch_size=256, log_std_min=-5.0),
@@ -132,36 +133,60 @@ def from_json(text: str, source: str) -> RunConfig:
         raise ValueError(f"{source} is not JSON: {error}.") from error
     if not isinstance(data, dict):
         raise ValueError(f"{source} holds {type(data).__name__}. Allowed: an object with the fields of a run.")
-    start = preset_config(data.get("preset", "laptop"), data.get("env", "ant_maze"))
-    return _replace(start, data, source)
+    try:
+        start = preset_config(data.get("preset", "laptop"), data.get("env", "ant_maze"))
+    except ValueError as error:
+        raise ValueError(f"{source}: {error}") from error
+    return replace(start, data, lambda path: f"{source}: {path}")
 
 
-def _replace(config: Any, data: dict[str, Any], source: str, prefix: str = "") -> Any:
-    """`config` with the fields in `data`, nested ones too."""
-    hints = typing.get_type_hints(type(config))
+def replace(config: Any, data: Mapping[str, Any], spell: Callable[[str], str], prefix: str = "") -> Any:
+    """`config` with the fields in `data`, nested ones too.
+
+    Args:
+        config: a configuration.
+        data: field -> value, or a mapping of the same kind for a field that is a configuration.
+        spell: what a message calls the field with a path such as `explorer.sac.lr`.
+        prefix: of the paths; for the recursion.
+
+    Raises:
+        ValueError: an unknown field, a value of the wrong type, or one that the configuration refuses.
+    """
+    known = {item.name for item in dataclasses.fields(config)}
     changes = {}
     for name, value in data.items():
         path = f"{prefix}{name}"
-        validate.one_of(f"{source}: field", path, [f"{prefix}{known}" for known in hints])
+        validate.one_of(spell("field"), path, [f"{prefix}{field}" for field in known])
         current = getattr(config, name)
         if dataclasses.is_dataclass(current):
-            if not isinstance(value, dict):
-                raise ValueError(f"{source}: {path}={value!r}. Allowed: an object.")
-            changes[name] = _replace(current, value, source, f"{path}.")
+            if not isinstance(value, Mapping):
+                raise ValueError(f"{spell(path)}={value!r}. Allowed: an object.")
+            changes[name] = replace(current, value, spell, f"{path}.")
         else:
-            changes[name] = _typed(path, value, current, source)
-    return dataclasses.replace(config, **changes)
+            changes[name] = _typed(spell(path), value, current)
+    try:
+        return dataclasses.replace(config, **changes)
+    except ValueError as error:
+        text, count = re.subn(rf"\b{type(config).__name__}\.(\w+)", lambda m: spell(prefix + m[1]), str(error))
+        if count == 0:  # A check between fields, or one that does not say which configuration it is of.
+            text = re.sub(r"^(\w+)(?==)", lambda m: spell(prefix + m[1]) if m[1] in known else m[1], text)
+        raise ValueError(text) from error
 
 
-def _typed(path: str, value: Any, current: Any, source: str) -> Any:
+def _typed(name: str, value: Any, current: Any) -> Any:
     """`value` in the type of the field's present value."""
-    if isinstance(current, tuple) and isinstance(value, list):
+    if isinstance(current, tuple) and isinstance(value, list | tuple):
         return tuple(value)
     if isinstance(current, float) and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if type(value) is not type(current):
-        raise ValueError(f"{source}: {path}={value!r}. Allowed: a value of type {type(current).__name__}.")
+        raise ValueError(f"{name}={value!r}. Allowed: a value of type {type(current).__name__}.")
     return value
+
+
+def flag(path: str) -> str:
+    """The flag of a field: `explorer.sac.batch_size` is `--sac.batch-size`."""
+    return "--" + path.removeprefix("explorer.").replace("_", "-")
 
 
 def differences(saved: RunConfig, wanted: RunConfig) -> list[str]:

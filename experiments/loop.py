@@ -5,11 +5,11 @@ host one seed after the other. All randomness follows from the seed and the step
 that was never interrupted.
 """
 
-import functools
+import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from flax import struct
 import envs
 from envs import coverage
 from envs.base import Environment
-from envs.wrappers import make_collect
+from envs.wrappers import Collect, make_collect
 from experiments.checkpoint import Checkpoints
 from experiments.config import RunConfig
 from experiments.errors import RunError, disk_error
@@ -42,12 +42,12 @@ class RunState:
     explorer: ExplorerState
     env: Any
     """Compiled environments: one `EnvState` with a leading axis. Others: a tuple of states."""
-    visited: Array
-    """Coverage cells seen, bool `[S, cells]`, NumPy."""
-    positions: Array
-    """Where each step began, from above, `[S, steps, 2]` [m], NumPy; `[S, 0, 2]` without a floor plan."""
-    episode_steps: Array
-    """The step of its episode that each step was, int32 `[S, steps]`, NumPy."""
+    visited: np.ndarray
+    """Coverage cells seen, bool `[S, cells]`."""
+    positions: np.ndarray
+    """Where each step began, from above, `[S, steps, 2]` [m]; `[S, 0, 2]` without a floor plan."""
+    episode_steps: np.ndarray
+    """The step of its episode that each step was, int32 `[S, steps]`."""
 
 
 class Programs(NamedTuple):
@@ -58,8 +58,12 @@ class Programs(NamedTuple):
     """`collect(state, step, num_steps, uniform) -> (env, transitions [S, T], valid [S, T])`."""
     absorb: Callable[..., ExplorerState]
     """Take transitions in; nothing is learned yet."""
-    learn: Callable[..., tuple[ExplorerState, Metrics, Array]]
-    """Assess transitions, take them in, and improve. State as before where anything came out non-finite."""
+    learn: Callable[..., tuple[ExplorerState, Metrics, dict[str, Array]]]
+    """`learn(step, state, transitions, valid, obs, num_data) -> (state, metrics, finite)`: assess transitions, take
+    them in, and improve. `finite` says of each metric and each part of the state whether it is, `[S]`; where one is
+    not, the state is as it was, of all seeds."""
+    mark: Callable[[np.ndarray, Array, Array], Array]
+    """`mark(visited [S, cells], obs [S, T, O], valid [S, T]) -> visited`."""
 
 
 def make_environment(config: RunConfig) -> Environment:
@@ -77,7 +81,6 @@ def make_programs(config: RunConfig, env: Environment, explorer: Explorer) -> Pr
     capacity = config.explorer.steps_per_round
     seeds = jnp.arange(config.seed, config.seed + config.num_seeds)
     seed_keys = jax.vmap(jax.random.key)(seeds)
-    collect_one = make_collect(env, capacity)
 
     def act(key: Key, actor: Any, obs: Array, uniform: Array) -> Array:
         return jnp.where(uniform, explorer.act_uniformly(key, obs), explorer.act(key, actor, obs))
@@ -100,28 +103,7 @@ def make_programs(config: RunConfig, env: Environment, explorer: Explorer) -> Pr
 
     actors = jax.jit(jax.vmap(explorer.actor))
 
-    if env.compiled:
-
-        @jax.jit
-        def collect_all(keys: Key, env_state: Any, actor: Any, num_steps: Array, uniform: Array):
-            def one(key: Key, env_state: Any, actor: Any):
-                return collect_one(key, env_state, lambda k, obs: act(k, actor, obs, uniform), num_steps)
-
-            return jax.vmap(one)(keys, env_state, actor)
-    else:
-        act_on_host = jax.jit(act)
-        take = jax.jit(lambda tree, i: jax.tree.map(lambda leaf: leaf[i], tree))
-
-        def collect_all(keys: Key, env_state: Any, actor: Any, num_steps: Array, uniform: Array):
-            states, chunks = [], []
-            for i, state in enumerate(env_state):
-                own = take(actor, i)
-                state, *chunk = collect_one(
-                    keys[i], state, lambda k, obs, own=own: act_on_host(k, own, obs, uniform), int(num_steps)
-                )
-                states.append(state)
-                chunks.append(tuple(chunk))
-            return tuple(states), *jax.tree.map(lambda *leaves: np.stack(leaves), *chunks)
+    collect_all = (_collect_on_device if env.compiled else _collect_on_host)(make_collect(env, capacity), act)
 
     def collect(state: RunState, step: int, num_steps: int, uniform: bool) -> tuple[Any, Transition, Array]:
         return collect_all(keys(COLLECT, step), state.env, actors(state.explorer), num_steps, uniform)
@@ -130,21 +112,73 @@ def make_programs(config: RunConfig, env: Environment, explorer: Explorer) -> Pr
         assess_key, improve_key = jax.random.split(key)
         seen = explorer.assess(assess_key, state, transitions, valid)
         after, metrics = explorer.improve(improve_key, explorer.observe(state, transitions, valid), obs, num_data)
-        finite = jnp.all(jnp.array([jnp.isfinite(value) for value in metrics.values()] or [True]))
-        kept = jax.tree.map(lambda new, old: jnp.where(finite, new, old), after, state)
-        return kept, {**seen, **metrics}, finite
+        # The state too: what the last update of a round broke would show in the next round's metrics only.
+        parts = {"belief": after.belief, "behaviour": after.behaviour, "normalizers": after.normalizers}
+        finite = {name: jnp.isfinite(value) for name, value in metrics.items()}
+        finite |= {f"the state of the {name}": _all_finite(part) for name, part in parts.items()}
+        return after, {**seen, **metrics}, finite
 
-    learn_all = jax.jit(jax.vmap(learn, in_axes=(0, 0, 0, 0, 0, None)), donate_argnums=1)
+    def learn_all(keys: Key, state: ExplorerState, transitions: Transition, valid: Array, obs: Array, num_data: Array):
+        one = jax.vmap(learn, in_axes=(0, 0, 0, 0, 0, None))
+        after, metrics, finite = one(keys, state, transitions, valid, obs, num_data)
+        good = jnp.all(jnp.stack(list(finite.values())))
+        return jax.tree.map(lambda new, old: jnp.where(good, new, old), after, state), metrics, finite
+
+    learn_all = jax.jit(learn_all, donate_argnums=1)
+
+    def mark_one(visited: Array, obs: Array, valid: Array) -> Array:
+        return coverage.update(visited, jnp.where(valid, jax.vmap(env.coverage.cell)(obs), -1))
 
     return Programs(
         init=init,
         collect=collect,
         absorb=jax.jit(jax.vmap(explorer.observe), donate_argnums=0),
         learn=lambda step, *args: learn_all(keys(LEARN, step), *args),
+        mark=jax.jit(jax.vmap(mark_one)),
     )
 
 
-def current_obs(env: Environment, env_state: Any) -> Array:
+CollectAll: TypeAlias = Callable[[Key, Any, Any, int, bool], tuple[Any, Transition, Array]]
+"""`collect_all(keys [S], env_state, actors [S], num_steps, uniform) -> (env_state, transitions [S, T], valid [S, T])`."""
+
+
+def _collect_on_device(collect: Collect, act: Callable[..., Array]) -> CollectAll:
+    """All seeds at once, in one program whatever `num_steps` and `uniform` are."""
+
+    @jax.jit
+    def collect_all(keys: Key, env_state: Any, actors: Any, num_steps: int, uniform: bool):
+        def one(key: Key, env_state: Any, actor: Any):
+            return collect(key, env_state, lambda k, obs: act(k, actor, obs, uniform), num_steps)
+
+        return jax.vmap(one)(keys, env_state, actors)
+
+    return collect_all
+
+
+def _collect_on_host(collect: Collect, act: Callable[..., Array]) -> CollectAll:
+    """One seed after the other."""
+    act = jax.jit(act)
+    take = jax.jit(lambda tree, i: jax.tree.map(lambda leaf: leaf[i], tree))
+
+    def collect_all(keys: Key, env_state: Any, actors: Any, num_steps: int, uniform: bool):
+        states, chunks = [], []
+        for i, state in enumerate(env_state):
+            own = take(actors, i)
+            state, *chunk = collect(keys[i], state, lambda k, obs, own=own: act(k, own, obs, uniform), num_steps)
+            states.append(state)
+            chunks.append(tuple(chunk))
+        return tuple(states), *jax.tree.map(lambda *leaves: np.stack(leaves), *chunks)
+
+    return collect_all
+
+
+def _all_finite(tree: Any) -> Array:
+    """Whether every floating-point number in a tree is finite."""
+    leaves = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    return jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in leaves] or [True]))
+
+
+def current_obs(env: Environment, env_state: Any) -> Array | np.ndarray:
     """What the agents see now, `[S, O]`."""
     return env_state.obs if env.compiled else np.stack([state.obs for state in env_state])
 
@@ -191,18 +225,31 @@ def run(config: RunConfig, out: Path, *, env: Environment | None = None, resume:
     )
     progress = Progress(config.steps, start_step=step, num_cells=env.coverage.num_cells)
     if resume:
-        progress.say(f"Going on from step {step:,}." if restored else "No checkpoint yet: starting over.")
+        progress.say(f"Going on from step {step:,}" if restored else "There is no checkpoint yet: starting over")
     try:
         state = _carry_on(config, out, env, programs, state, step, earlier, checkpoints, metrics, board, progress)
     finally:
         progress.close()
         metrics.close()
         board.close()
+    _write_walk(out, state)
+    return state
+
+
+def _write_walk(out: Path, state: RunState) -> None:
+    """The last file of a run, whole or not at all: it being there says that the run is finished."""
+    draft = out / f"{WALK}.tmp"
     try:
-        np.savez_compressed(out / WALK, positions=state.positions, episode_steps=state.episode_steps)
+        with draft.open("wb") as file:
+            np.savez_compressed(file, positions=state.positions, episode_steps=state.episode_steps)
+        draft.replace(out / WALK)
     except OSError as error:
         raise disk_error("write the walk", out, error, "finish with --resume") from error
-    return state
+
+
+def is_finished(out: Path) -> bool:
+    """Whether the run in `out` has taken all its steps."""
+    return (out / WALK).is_file()
 
 
 def _carry_on(
@@ -225,10 +272,11 @@ def _carry_on(
     def tell(what: str) -> None:
         if what not in told:
             told.add(what)
-            progress.say(f"Compiling the {what} step: up to a minute the first time, seconds from the cache later.")
+            progress.say(f"Compiling the {what} step: up to a minute the first time, seconds from the cache later")
 
     # Positions are written in place; a restored array may be read-only.
-    state = state.replace(
+    state = dataclasses.replace(
+        state,
         visited=np.array(state.visited),
         positions=np.array(state.positions),
         episode_steps=np.array(state.episode_steps),
@@ -238,12 +286,12 @@ def _carry_on(
         before = state.env
         if env.compiled:
             tell("environment")
-        episode_step = np.asarray(_episode_step(env, before))
+        episode_step = _episode_step(env, before)
         env_state, transitions, valid = programs.collect(
             state, first, end - first, first < config.explorer.warm_up_steps
         )
         if end < config.explorer.warm_up_steps:
-            told_metrics, finite = {}, np.ones(config.num_seeds, bool)
+            told_metrics, finite = {}, {}
             learned = programs.absorb(state.explorer, transitions, valid)
         else:
             tell("learning")
@@ -251,13 +299,15 @@ def _carry_on(
                 first, state.explorer, transitions, valid, current_obs(env, env_state), end
             )
         told_metrics, finite = jax.device_get((told_metrics, finite))
-        if not np.all(finite):
-            state = state.replace(explorer=learned)
-            checkpoints.save(first, state, {"wall_time": time.monotonic() - began})
-            raise _diverged(told_metrics, finite, config, end, out)
+        if not all(map(np.all, finite.values())):
+            metrics.sync()
+            checkpoints.save(
+                first, dataclasses.replace(state, explorer=learned), {"wall_time": time.monotonic() - began}
+            )
+            raise _diverged(finite, config, first, end, out)
         transitions, valid = jax.device_get((transitions, valid))
-        _remember(env, state, transitions, valid, episode_step, first, end)
-        state = state.replace(explorer=learned, env=env_state)
+        _remember(env, programs, state, transitions, valid, episode_step, first, end)
+        state = dataclasses.replace(state, explorer=learned, env=env_state)
         now = time.monotonic()
         rows = _rows(config, state, told_metrics, end, now - began, (end - first) / (now - round_began))
         metrics.append(rows)
@@ -269,23 +319,25 @@ def _carry_on(
     return state
 
 
-def _episode_step(env: Environment, env_state: Any) -> Array:
-    return env_state.num_steps if env.compiled else np.stack([state.num_steps for state in env_state])
+def _episode_step(env: Environment, env_state: Any) -> np.ndarray:
+    """The step of its episode that each seed's next step is, `[S]`."""
+    return np.asarray(env_state.num_steps if env.compiled else [state.num_steps for state in env_state])
 
 
 def _remember(
     env: Environment,
+    programs: Programs,
     state: RunState,
     transitions: Transition,
     valid: Array,
-    episode_step: Array,
+    episode_step: np.ndarray,
     first: int,
     end: int,
 ) -> None:
     """Note in `state`, in place, which cells the round saw and where it went."""
     count = end - first
     obs = transitions.obs[:, :count]
-    state.visited[:] = _look_up(env)(state.visited, transitions.obs, valid)
+    state.visited[:] = programs.mark(state.visited, transitions.obs, valid)
     if env.floor_plan is None:
         return
     state.positions[:, first:end] = obs[..., list(env.floor_plan.position)]
@@ -293,17 +345,6 @@ def _remember(
     for t in range(count):
         state.episode_steps[:, first + t] = episode_step
         episode_step = np.where(done[:, t], 0, episode_step + 1)
-
-
-@functools.cache
-def _look_up(env: Environment) -> Callable[[Array, Array, Array], Array]:
-    """Take observations `[S, T, O]` into the cells seen, `[S, cells]`, where they are valid, `[S, T]`. Jitted once."""
-
-    def one(visited: Array, obs: Array, valid: Array) -> Array:
-        cells = jax.vmap(env.coverage.cell)(obs)
-        return coverage.update(visited, jnp.where(valid, cells, -1))
-
-    return jax.jit(jax.vmap(one))
 
 
 def _rows(config: RunConfig, state: RunState, metrics: Metrics, step: int, wall_time: float, speed: float) -> list[Row]:
@@ -325,12 +366,13 @@ def _rows(config: RunConfig, state: RunState, metrics: Metrics, step: int, wall_
     return rows
 
 
-def _diverged(metrics: Metrics, finite: Array, config: RunConfig, step: int, out: Path) -> RunError:
+def _diverged(finite: dict[str, Array], config: RunConfig, first: int, end: int, out: Path) -> RunError:
     """What to say of numbers that are not finite."""
-    names = [name for name, values in metrics.items() if not np.all(np.isfinite(np.asarray(values)))]
-    seeds = [str(config.seed + int(i)) for i in np.flatnonzero(~np.asarray(finite))]
+    names = [name for name, values in finite.items() if not np.all(values)]
+    seeds = [config.seed + i for i in range(config.num_seeds) if not all(values[i] for values in finite.values())]
     return RunError(
-        f"{', '.join(names)} not finite in the round that ends at step {step} (seed {', '.join(seeds)}). The last good "
-        f"round is saved in {out / 'checkpoints'}. --resume would repeat this round to the bit: start again in a new "
-        "--out with a smaller --fit.lr or --sac.lr, or with --imagination.bound set."
+        f"the round of steps {first:,} to {end:,} came out with numbers that are not finite: {', '.join(names)} "
+        f"(seed {', '.join(map(str, seeds))}). The state before it is saved in {out / 'checkpoints'}. What to do: "
+        "--resume would repeat this round to the bit, so start again in a new --out with a smaller --fit.lr or "
+        "--sac.lr, or with --imagination.bound set."
     )

@@ -1,5 +1,7 @@
 """What a finished run leaves to look at: three pictures and a table, made from its files alone."""
 
+import shlex
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,6 +11,7 @@ import numpy as np
 from envs.base import Environment
 from experiments import loop, plot
 from experiments.config import RunConfig
+from experiments.errors import RunError
 from experiments.log import read_metrics, summary
 
 PANELS = 4
@@ -28,7 +31,7 @@ def series(rows: Sequence[dict[str, Any]], field: str) -> tuple[np.ndarray, np.n
 
 
 def write(config: RunConfig, out: Path, env: Environment) -> str:
-    """Draw the pictures of the run in `out`, and give its closing table.
+    """Draw the pictures of the finished run in `out` (the floor plan of its first seed), and give its closing table.
 
     Raises:
         RunError: the run's files cannot be read, or the pictures cannot be written.
@@ -41,14 +44,15 @@ def write(config: RunConfig, out: Path, env: Environment) -> str:
     plot.plot_coverage(files["coverage"], [plot.Curves(config.method, steps, covered)], env.coverage, title=title)
     if env.floor_plan is not None:
         files["visitation"] = out / "visitation.png"
-        walk = np.load(out / loop.WALK)
-        ends = [round(config.steps * (panel + 1) / PANELS) for panel in range(PANELS)]
-        cells = covered[0] * env.coverage.num_cells
-        seen = [int(cells[np.searchsorted(steps, end, side="right") - 1]) for end in ends]
+        positions, episode_steps = _read_walk(out / loop.WALK)
+        panels = min(PANELS, config.steps)
+        ends = [config.steps * panel // panels for panel in range(1, panels + 1)]
+        cells = np.round(covered[0] * env.coverage.num_cells).astype(int)
+        seen = [int(cells[max(0, np.searchsorted(steps, end, side="right") - 1)]) for end in ends]
         plot.plot_visitation(
             files["visitation"],
-            walk["positions"][0],
-            walk["episode_steps"][0],
+            positions[0],
+            episode_steps[0],
             seen,
             env.floor_plan,
             env.coverage,
@@ -60,4 +64,16 @@ def write(config: RunConfig, out: Path, env: Environment) -> str:
     if config.explorer.reward_units == "raw":
         unit = "intrinsic reward (raw units, squared)"
     plot.plot_intrinsic_reward(files["reward"], [plot.Curves(config.method, steps, reward)], unit=unit, title=title)
-    return summary(rows, num_cells=env.coverage.num_cells, unit=env.coverage.unit, files=files)
+    table = summary(rows, num_cells=env.coverage.num_cells, unit=env.coverage.unit, files=files)
+    if env.view is not None:
+        table += f"\n\nTo see it move: python -m experiments.render {shlex.quote(str(out))}"
+    return table
+
+
+def _read_walk(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Positions `[S, steps, 2]` [m] and the step of the episode of each, `[S, steps]`."""
+    try:
+        with np.load(path) as walk:
+            return walk["positions"], walk["episode_steps"]
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        raise RunError(f"cannot read {path}: {error}. What to do: remove it, and finish with --resume.") from error

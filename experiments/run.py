@@ -1,22 +1,30 @@
 """The command line: `python -m experiments.run --env=ant_maze`."""
 
+import dataclasses
 import json
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
 import jax
-import tyro
 
-from experiments import loop, report
-from experiments.config import RunConfig, differences, from_json, preset_config, to_json
+import envs
+from envs.base import ENGINES, Environment
+from experiments import flags, loop, report
+from experiments.config import RunConfig, differences, flag, from_json, preset_config, replace, to_json
 from experiments.errors import RunError, disk_error
+from jaxplore.methods import METHODS
+from jaxplore.networks import ACTIVATIONS, INITIALIZERS
 
+PROGRAM = "python -m experiments.run"
 RUNS = Path("runs")
+SCRAPS = {"versions.json", "versions.json.tmp", "config.json.tmp"}
+"""What a run that was killed while it started may have left."""
 PACKAGES = (
     *("jaxplore", "jax", "jaxlib", "flax", "optax", "distrax", "mujoco", "mujoco-mjx"),
     *("brax", "gymnasium", "numpy", "orbax-checkpoint"),
@@ -28,11 +36,11 @@ class CommandLine:
     """What the program does beside the run itself."""
 
     out: str | None = None
-    """Directory of the run. Default: a new one, runs/ENV-METHOD-PRESET-seedN."""
+    """Directory of the run. By default a new one: runs/ENV-METHOD-PRESET-seedN."""
     resume: bool = False
     """Go on with the run in --out from its latest checkpoint."""
     config: str | None = None
-    """A config.json to start from, as a run saves it; flags come on top."""
+    """A config.json to start from, as every run saves it; other flags come on top."""
     version: bool = False
     """Print the versions of everything that results depend on, and stop."""
 
@@ -50,7 +58,7 @@ def versions() -> dict[str, str]:
 
 def use_compilation_cache() -> None:
     """Keep compiled programs in the user's own cache directory, unless JAX has been told of another."""
-    if jax.config.jax_compilation_cache_dir is None:
+    if jax.config.values["jax_compilation_cache_dir"] is None:
         base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
         directory = Path(base) / "jaxplore" / "jax"
         try:
@@ -90,32 +98,33 @@ def parse(argv: Sequence[str]) -> tuple[CommandLine, RunConfig]:
     """
     out, config_path = _option(argv, "out"), _option(argv, "config")
     preset, env = _option(argv, "preset"), _option(argv, "env")
-    saved = Path(out) / "config.json" if out and "--resume" in argv else None
-    if config_path is None and saved is not None and saved.exists():
-        config_path = str(saved)
+    if config_path is None and out and "--resume" in argv and os.path.exists(Path(out) / "config.json"):
+        config_path = str(Path(out) / "config.json")
     if config_path is not None:
-        try:
-            start = from_json(Path(config_path).read_text(), config_path)
-        except (OSError, UnicodeDecodeError) as error:
-            raise RunError(f"cannot read the configuration {config_path}: {error}.") from error
+        start = _read_config(Path(config_path))
         if preset is not None and preset != start.preset:
             raise ValueError(f"--preset={preset} disagrees with {config_path}, which has {start.preset!r}. Give one.")
     else:
         start = preset_config(preset or "laptop", env or "ant_maze")
-
-    @dataclass(frozen=True)
-    class Arguments:
-        run: Annotated[RunConfig, tyro.conf.arg(name="")]
-        command: Annotated[CommandLine, tyro.conf.arg(name="")]
-
-    parsed = tyro.cli(
-        Arguments,
-        prog="python -m experiments.run",
-        description="Explore an environment by a belief's own uncertainty, and draw what was seen.",
-        default=Arguments(start, CommandLine()),
-        args=list(argv),
+    command, changes = flags.parse(
+        argv,
+        (CommandLine(), start),
+        prog=PROGRAM,
+        description=(
+            "Explore an environment by a belief's own uncertainty, and draw what was seen.\n\n"
+            "The defaults below are those of the preset; --preset=paper --help shows the paper's."
+        ),
+        unprefixed=["explorer"],
+        choices={
+            "env": list(envs.FACTORIES),
+            "method": list(METHODS),
+            "backend": ["auto", *ENGINES],
+            "activation": list(ACTIVATIONS),
+            "init": list(INITIALIZERS),
+        },
     )
-    return parsed.command, parsed.run
+    command = {name: value or None if name in ("out", "config") else value for name, value in command.items()}
+    return CommandLine(**command), replace(start, changes, flag)
 
 
 def choose_directory(command: CommandLine, config: RunConfig) -> Path:
@@ -133,27 +142,38 @@ def choose_directory(command: CommandLine, config: RunConfig) -> Path:
         return next(path for path in names if not path.exists())
     out = Path(command.out)
     saved = out / "config.json"
+    try:
+        there = {entry.name for entry in out.iterdir()} if out.is_dir() else None
+    except OSError as error:
+        raise disk_error("look for a run", out, error) from error
     if not command.resume:
-        if out.is_dir() and any(out.iterdir()):
-            what = "another run" if saved.exists() else "other files"
+        if there:
+            what = "another run" if saved.name in there else "other files"
             raise RunError(f"--out={out} holds {what}. Give another directory, or --resume to go on with the run.")
         return out
-    if not out.is_dir():
+    if there is None:
         raise RunError(f"--out={out} is not there, so it cannot be resumed. Leave --resume out to start a run.")
-    if saved.exists():
-        changed = differences(from_json(saved.read_text(), str(saved)), config)
+    if saved.name in there:
+        changed = differences(_read_config(saved), config)
         if changed:
             raise ValueError(
                 f"--resume: the configuration disagrees with {saved} in {'; '.join(changed)}. "
                 "Resume with the saved values, or start a run in another --out."
             )
-    elif any(entry.name != "config.json.tmp" for entry in out.iterdir()):
+    elif there - SCRAPS:
         raise RunError(f"--out={out} holds no run (no config.json). Give the directory of a run.")
     return out
 
 
+def _read_config(path: Path) -> RunConfig:
+    try:
+        return from_json(path.read_text(), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        raise RunError(f"cannot read the configuration {path}: {error}.") from error
+
+
 def write_config(out: Path, config: RunConfig) -> None:
-    """Save the configuration and the versions, whole or not at all.
+    """Save the configuration and the versions, whole or not at all; those of a run that goes on stay as they are.
 
     Raises:
         RunError: the disk is full or cannot be written.
@@ -164,11 +184,21 @@ def write_config(out: Path, config: RunConfig) -> None:
             ("versions.json", json.dumps(versions(), indent=2) + "\n"),
             ("config.json", to_json(config)),
         ):
-            draft = out / f"{name}.tmp"
-            draft.write_text(text)
-            draft.replace(out / name)
+            if not (out / name).exists():
+                draft = out / f"{name}.tmp"
+                draft.write_text(text)
+                draft.replace(out / name)
     except OSError as error:
         raise disk_error("start the run", out, error, "start it again") from error
+
+
+def changed_versions(out: Path) -> list[str]:
+    """What has another version now than when the run in `out` began, as `name: then -> now`."""
+    try:
+        then: dict[str, Any] = json.loads((out / "versions.json").read_text())
+    except (OSError, ValueError):
+        return []
+    return [f"{name}: {then[name]} -> {now}" for name, now in versions().items() if then.get(name, now) != now]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -179,35 +209,43 @@ def main(argv: Sequence[str] | None = None) -> int:
         if command.version:
             print("\n".join(f"{name} {version}" for name, version in versions().items()))
             return 0
+        # The environment and the method refuse what they cannot do when they are built: before anything is written.
+        env = loop.make_environment(config)
+        config = dataclasses.replace(config, backend=env.backend)  # So that another machine takes the same.
+        loop.make_run_explorer(config, env)
         out = choose_directory(command, config)
     except (ValueError, RunError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     try:
-        return carry_out(config, out, resume=command.resume)
-    except ValueError as error:  # The environment and the method refuse what they cannot do when they are built.
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+        return carry_out(config, out, env, resume=command.resume)
     except RunError as error:
         print(f"\nerror: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print(f"\nStopped. Go on with: python -m experiments.run --out={out} --resume", file=sys.stderr)
+        again = f"{PROGRAM} --out={shlex.quote(str(out))} --resume"
+        print(f"\nStopped. To go on from the latest checkpoint: {again}", file=sys.stderr)
         return 130
 
 
-def carry_out(config: RunConfig, out: Path, *, resume: bool) -> int:
-    """Build, run, draw, and close with the summary table."""
+def carry_out(config: RunConfig, out: Path, env: Environment, *, resume: bool) -> int:
+    """Run, draw, and close with the summary table."""
     use_compilation_cache()
-    env = loop.make_environment(config)
-    loop.make_run_explorer(config, env)  # Refuses here, before anything is written.
+    if resume and (changed := changed_versions(out)):
+        print(f"Versions have changed, so not to the bit: {'; '.join(changed)}", file=sys.stderr)
     write_config(out, config)
-    seeds = str(config.seed) if config.num_seeds == 1 else f"{config.seed}-{config.seed + config.num_seeds - 1}"
-    print(
-        f"{config.method} on {config.env} ({config.preset} preset), seed {seeds}, {config.steps:,} steps; "
-        f"physics: {env.backend}, device: {jax.devices()[0].device_kind}; writing to {out}"
-    )
-    loop.run(config, out, env=env, resume=resume)
+    if resume and loop.is_finished(out):
+        print(f"The run in {out} is finished: drawing it again.", flush=True)
+    else:
+        last = config.seed + config.num_seeds - 1
+        seeds = f"seed {config.seed}" if config.num_seeds == 1 else f"seeds {config.seed} to {last}"
+        print(
+            f"{config.method} on {config.env}: {config.preset} preset, {seeds}, {config.steps:,} steps\n"
+            f"physics: {env.backend}, learning: {jax.devices()[0].device_kind}\n"
+            f"writing to {out}",
+            flush=True,
+        )
+        loop.run(config, out, env=env, resume=resume)
     print("\n" + report.write(config, out, env))
     return 0
 

@@ -80,8 +80,8 @@ class ImaginationConfig:
     """Standard deviations of the real data that imagined observations and changes stay within. 0: no bound (paper)."""
     replay_capacity: int = 320_000
     """Imagined transitions kept. nnaisense/max makes 320,000 in a round."""
-    restart: bool = True
-    """Whether each round starts with a new policy and empty imagined data (nnaisense/max), or goes on."""
+    restart_every: int = 1
+    """Rounds that a policy and its imagined data live for. 1: new ones each round (nnaisense/max). 0: for good."""
     normalize_reward: bool = False
     """Whether rewards are divided by their standard deviation over the imagined data. Paper: no."""
     act_greedily: bool = True
@@ -91,7 +91,7 @@ class ImaginationConfig:
         checks = Checks(self)
         for field in ("num_models", "num_actors", "horizon", "num_rollouts", "updates_per_rollout", "replay_capacity"):
             checks.at_least(field, 1)
-        for field in ("num_random_rollouts", "real_updates"):
+        for field in ("num_random_rollouts", "real_updates", "restart_every"):
             checks.at_least(field, 0)
         checks.in_range("bound", 0.0)
         for field in ("real_fraction", "current_fraction"):
@@ -110,6 +110,8 @@ class ImaginationState:
 
     learner: SACState
     imagined: Replay[Transition]
+    age: Array
+    """Rounds that the policy has lived through, int32."""
 
 
 def make_imagination(
@@ -140,7 +142,9 @@ def make_imagination(
     example = Transition(jnp.zeros(obs_size), jnp.zeros(action_size), jnp.zeros(()), jnp.zeros(obs_size), flag, flag)
 
     def init(key: Key) -> ImaginationState:
-        return ImaginationState(learner.init(key), replay.init(example, config.replay_capacity))
+        return ImaginationState(
+            learner.init(key), replay.init(example, config.replay_capacity), jnp.zeros((), jnp.int32)
+        )
 
     def act(key: Key, actor: Any, normalizers: Normalizers, obs: Array) -> Array:
         seen = normalizer.normalize(normalizers.obs, obs)
@@ -212,8 +216,11 @@ def make_imagination(
     def improve(key: Key, state: ImaginationState, experience: Experience) -> tuple[ImaginationState, Metrics]:
         init_key, real_key, rollouts_key = jax.random.split(key, 3)
         normalizers = experience.normalizers
-        if config.restart:
+        if config.restart_every == 1:
             state = init(init_key)
+        elif config.restart_every > 1:
+            due = state.age == config.restart_every
+            state = jax.tree.map(lambda new, old: jnp.where(due, new, old), init(init_key), state)
         needs_real = config.real_updates > 0 or config.real_fraction > 0
         real = label(experience) if needs_real else experience.data
         learner_state, metrics = state.learner, _no_metrics(learner, obs_size, action_size)
@@ -275,7 +282,7 @@ def make_imagination(
         learner_state, imagined, metrics, seen = jax.lax.fori_loop(
             0, config.num_rollouts, one_rollout, (learner_state, state.imagined, metrics, seen)
         )
-        return ImaginationState(learner_state, imagined), {**metrics, **seen}
+        return ImaginationState(learner_state, imagined, state.age + 1), {**metrics, **seen}
 
     return Behaviour(init, improve, lambda state: learner.actor(state.learner), act)
 

@@ -119,7 +119,9 @@ def sample_tanh_gaussian(key: Key, params: GaussianParams) -> tuple[Array, Array
     """
     gaussian = distrax.MultivariateNormalDiag(params.mean, jnp.exp(params.log_std))
     squashed = distrax.Transformed(gaussian, distrax.Block(distrax.Tanh(), 1))
-    return squashed.sample_and_log_prob(seed=key)
+    # distrax adds its sample axis by rank promotion; callers may have forbidden that.
+    with jax.numpy_rank_promotion("allow"):
+        return squashed.sample_and_log_prob(seed=key)
 
 
 def tanh_mean(params: GaussianParams) -> Array:

@@ -113,6 +113,17 @@ class TestModel:
         assert len(list(collision_driver.geom_pairs(model))) == 13 * 6  # floor, four sides, inner wall
         assert len(collision_driver.make_condim(model)) == ant_maze.MAX_CONTACTS == 24
 
+    def test_fewer_solver_iterations_change_no_bit(self, host):
+        full = make_model()
+        full.opt.iterations, full.opt.ls_iterations = 100, 50
+        physics = host_backend.make_physics(full, 5)
+        state, rng = host.reset(jax.random.key(0)), np.random.default_rng(0)
+        for _ in range(300):
+            action = rng.uniform(-1, 1, 8).astype(np.float32)
+            expected = physics.step(state.physics, action)
+            state, _ = host.step(state, action)
+            np.testing.assert_array_equal(state.physics, expected)
+
     def test_cameras_for_videos(self, model):
         assert model.camera("overview").id >= 0
         assert model.camera("track").id >= 0

@@ -12,17 +12,13 @@ from jaxplore.generator import GeneratorConfig, make_generator
 from jaxplore.networks import MLP, count_params
 
 TARGET = MLP(hidden=(48,), output_size=3)
-KERNELS = {"hidden_0": (6, "he"), "output": (48, "lecun")}
-"""Layer -> (fan in, initialiser), as `MLP` has them by default."""
 
 
-def example(seed=0):
-    return TARGET.init(jax.random.key(seed), jnp.zeros(6))["params"]
-
-
-def draws(config, tree=None, num_inits=64, num_networks=32):
+def draws(config, tree=None, num_inits=128, num_networks=32):
     """Networks of many generators, fresh from `init`: every leaf `[inits, networks, ...]`."""
-    generator = make_generator(example() if tree is None else tree, config)
+    if tree is None:
+        tree = TARGET.init(jax.random.key(0), jnp.zeros(6))["params"]
+    generator = make_generator(tree, config)
 
     def one(key):
         init_key, noise_key = jax.random.split(key)
@@ -31,51 +27,43 @@ def draws(config, tree=None, num_inits=64, num_networks=32):
     return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(1), num_inits)))
 
 
-@pytest.mark.parametrize(("rule", "noise"), [("match_example", "shared"), ("he", "per_layer"), ("lecun", "shared")])
-def test_sampled_networks_start_with_the_initialisers_spread(rule, noise):
-    # He: sqrt(2 / fan_in), LeCun: sqrt(1 / fan_in), over inits and networks; biases: mean 0, std bias_std
-    networks = draws(GeneratorConfig(noise=noise, init_std=rule, bias_std=0.2))
-    for layer, (inputs, own_rule) in KERNELS.items():
-        used = own_rule if rule == "match_example" else rule
-        want = math.sqrt({"he": 2, "lecun": 1}[used] / inputs)
-        # The example's own spread is itself a sample, of 144 numbers in the smaller kernel.
-        tolerance = 0.15 if rule == "match_example" else 0.05
-        assert np.std(networks[layer]["kernel"]) == pytest.approx(want, rel=tolerance)
-        assert abs(np.mean(networks[layer]["kernel"])) < 0.05 * want
-        assert np.std(networks[layer]["bias"]) == pytest.approx(0.2, rel=0.15)
-
-
-def test_matching_an_example_matches_its_own_numbers():
-    # the root mean square of the example's entries per leaf, whatever drew them
-    tree = {"a": {"kernel": jnp.full((20, 30), 0.01), "other": jnp.full((3, 20, 10), -4.0)}}
-    networks = draws(GeneratorConfig(), tree)
-    assert np.std(networks["a"]["kernel"]) == pytest.approx(0.01, rel=0.05)
-    assert np.std(networks["a"]["other"]) == pytest.approx(4.0, rel=0.05)
-
-
 def relu_correlation(rho: float) -> float:
     """Correlation (about 0) of ReLU features of Gaussians with correlation rho (arc-cosine kernel, Cho & Saul 2009)."""
     return (math.sqrt(1 - rho**2) + rho * (math.pi - math.acos(rho))) / math.pi
 
 
-@pytest.mark.parametrize("constant_fraction", [0.0, 0.5])
-def test_share_of_the_variance_that_z_moves(constant_fraction):
-    # E[Var_z] / total: the features of unrelated z are correlated by relu_correlation twice, 0.494, so that z moves
-    # 0.506 of what constant_fraction leaves it
-    tree = {"kernel": jnp.ones((20, 30))}
-    kernel = draws(GeneratorConfig(constant_fraction=constant_fraction), tree, num_inits=128)["kernel"]
-    share = np.mean(np.var(kernel, axis=1, ddof=1)) / np.mean(kernel**2)
-    moved = 1 - relu_correlation(relu_correlation(0.0))
-    assert share == pytest.approx((1 - constant_fraction) * moved, rel=0.05)
+@pytest.mark.parametrize(
+    ("rule", "constant_fraction", "want"),
+    [
+        ("match_example", 0.5, (0.01, 4.0)),
+        ("he", 0.0, (math.sqrt(2 / 20), math.sqrt(2 / 60))),
+        ("lecun", 0.5, (math.sqrt(1 / 20), math.sqrt(1 / 60))),
+    ],
+)
+def test_sampled_networks_start_with_the_spread_that_the_rule_gives(rule, constant_fraction, want):
+    # over inits and networks. Kernels: mean 0, and the std of He, LeCun or the example's root mean square; a leaf with
+    # one axis: around the example's value (a LayerNorm's scale is 1) with std bias_std
+    tree = {"dense": jnp.full((20, 30), 0.01), "conv": jnp.full((3, 20, 10), -4.0), "scale": jnp.ones(50)}
+    config = GeneratorConfig(init_std=rule, constant_fraction=constant_fraction, bias_std=0.2)
+    networks = draws(config, tree)
+    for name, std in zip(("dense", "conv"), want, strict=True):
+        assert np.std(networks[name]) == pytest.approx(std, rel=0.05)
+        assert abs(np.mean(networks[name])) < 0.05 * std
+        # The share that z moves, E[Var_z] / total: features of unrelated z are correlated by relu_correlation twice,
+        # 0.494, so that z moves 0.506 of what constant_fraction leaves it.
+        moved = (1 - constant_fraction) * (1 - relu_correlation(relu_correlation(0.0)))
+        share = np.mean(np.var(networks[name], axis=1, ddof=1)) / np.mean(networks[name] ** 2)
+        assert share == pytest.approx(moved, rel=0.05)
+    assert np.mean(networks["scale"]) == pytest.approx(1.0, abs=0.02)
+    assert np.std(networks["scale"]) == pytest.approx(0.2, rel=0.05)
 
 
-def test_leaves_with_one_axis_start_around_the_example():
-    # a LayerNorm's scale is 1 and its bias 0 in the example; sampled networks must stay near that, not near 0
-    norm = nn.LayerNorm().init(jax.random.key(0), jnp.zeros(50))["params"]
-    networks = draws(GeneratorConfig(bias_std=0.1), {"norm": norm})
-    for name, want in {"scale": 1.0, "bias": 0.0}.items():
-        assert np.mean(networks["norm"][name]) == pytest.approx(want, abs=0.01)
-        assert np.std(networks["norm"][name]) == pytest.approx(0.1, rel=0.1)
+def test_networks_of_an_mlp_start_like_the_mlp():
+    # hidden layers sqrt(2 / fan_in), the last sqrt(1 / fan_in); the example's spread is itself a sample of 144 numbers
+    networks = draws(GeneratorConfig(noise="per_layer", hidden=(64,), bias_std=0.2))
+    for layer, want in {"hidden_0": math.sqrt(2 / 6), "output": math.sqrt(1 / 48)}.items():
+        assert np.std(networks[layer]["kernel"]) == pytest.approx(want, rel=0.15)
+        assert np.std(networks[layer]["bias"]) == pytest.approx(0.2, rel=0.2)
 
 
 class Nested(nn.Module):
@@ -150,11 +138,9 @@ def test_layer_order_and_offsets():
     np.testing.assert_array_equal(theta["kernel"], [[3, 4, 5], [6, 7, 8]])
 
 
-@pytest.mark.parametrize("noise", ["shared", "per_layer"])
-def test_sample_is_generate_for_each_z(noise):
+def test_sample_is_generate_for_each_z(nested):
     # vmap against a loop
-    generator = make_generator(example(), GeneratorConfig(noise=noise))
-    eta = generator.init(jax.random.key(1))
+    _, generator, eta = nested
     zs = generator.sample_noise(jax.random.key(2), 3)
     thetas = generator.sample(eta, zs)
     for i, z in enumerate(zs):

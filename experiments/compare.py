@@ -1,0 +1,152 @@
+"""`python -m experiments.compare RUN RUN ... --out=DIR`: methods side by side, over the seeds of all their runs."""
+
+import argparse
+import json
+import statistics
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from experiments import plot
+from experiments.config import RunConfig, from_json
+from experiments.errors import RunError, disk_error
+from experiments.log import duration, read_metrics
+from experiments.loop import make_environment
+from experiments.report import series
+
+GRID = 100
+"""Steps between two points of a comparison: runs of different rounds meet here."""
+
+
+class Outcome(NamedTuple):
+    """One seed of one run."""
+
+    seed: int
+    cells: int
+    """Coverage cells seen at the end."""
+    reached: tuple[int, ...]
+    """The step (end of its round) at which each further cell was seen: the first entry is the first cell's."""
+    minutes: float
+    """Wall time of the run that the seed was part of."""
+
+
+class Group(NamedTuple):
+    """All seeds of one method."""
+
+    label: str
+    outcomes: list[Outcome]
+    steps: np.ndarray
+    """`[T]`"""
+    coverage: np.ndarray
+    """`[S, T]`, 0 to 1."""
+
+
+def load(run: Path) -> tuple[RunConfig, list[dict[str, Any]]]:
+    """The configuration and the rows of a finished run.
+
+    Raises:
+        RunError: `run` holds no run, or one that has not finished.
+    """
+    try:
+        config = from_json((run / "config.json").read_text(), str(run / "config.json"))
+    except OSError as error:
+        raise RunError(f"{run} holds no run: cannot read {run / 'config.json'} ({error.strerror}).") from error
+    rows = read_metrics(run / "metrics.jsonl")
+    last = max((row["step"] for row in rows), default=0)
+    if last < config.steps:
+        raise RunError(f"{run} stands at step {last} of {config.steps}. Finish it with --resume first.")
+    return config, rows
+
+
+def outcomes(config: RunConfig, rows: Sequence[dict[str, Any]]) -> list[Outcome]:
+    """What became of each seed of a run."""
+    found = []
+    for seed in range(config.seed, config.seed + config.num_seeds):
+        own = [row for row in rows if row["seed"] == seed]
+        cells = own[-1]["cells"]
+        reached = tuple(next(row["step"] for row in own if row["cells"] >= count) for count in range(1, cells + 1))
+        found.append(Outcome(seed, cells, reached, own[-1]["wall_time"] / 60))
+    return found
+
+
+def group(runs: Sequence[Path]) -> tuple[RunConfig, list[Group]]:
+    """The runs by method, in the order in which the methods come.
+
+    Raises:
+        RunError: runs differ in environment or number of steps, or a seed of a method comes twice.
+    """
+    loaded = [load(run) for run in runs]
+    first = loaded[0][0]
+    labels = list(dict.fromkeys(config.method for config, _ in loaded))
+    groups = []
+    for label in labels:
+        own: list[Outcome] = []
+        curves = []
+        for run, (config, rows) in zip(runs, loaded, strict=True):
+            if (config.env, config.steps) != (first.env, first.steps):
+                raise RunError(
+                    f"{run} is of {config.env} over {config.steps} steps, {runs[0]} of {first.env} over {first.steps}. "
+                    "Compare runs of one environment and one length."
+                )
+            if config.method != label:
+                continue
+            steps, covered = series(rows, "coverage")
+            at = np.searchsorted(steps, np.arange(GRID, config.steps + 1, GRID), side="right") - 1
+            curves.append(covered[:, at])
+            own += outcomes(config, rows)
+        seeds = [outcome.seed for outcome in own]
+        if len(set(seeds)) < len(seeds):
+            raise RunError(f"{label}: seed {statistics.mode(seeds)} comes twice. Give each seed of a method once.")
+        groups.append(Group(label, own, np.arange(GRID, first.steps + 1, GRID), np.concatenate(curves)))
+    return first, groups
+
+
+def table(groups: Sequence[Group], num_cells: int, unit: str) -> str:
+    """A Markdown table: medians, and ranges in brackets."""
+    lines = [
+        f"| method | seeds | {unit} of {num_cells}: median (range) | each seed | all {num_cells} seen at step | minutes |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for one in groups:
+        cells = [outcome.cells for outcome in one.outcomes]
+        whole = [f"{outcome.reached[-1]:,}" for outcome in one.outcomes if outcome.cells == num_cells]
+        minutes = statistics.median(outcome.minutes for outcome in one.outcomes)
+        lines.append(
+            f"| `{one.label}` | {len(cells)} | {statistics.median(cells):g} ({min(cells)} to {max(cells)}) "
+            f"| {', '.join(map(str, cells))} | {', '.join(whole) or '-'} | {minutes:.1f} |"
+        )
+    return "\n".join(lines)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Print the table, write `coverage.png` and `comparison.json`; the exit status is 0, or 1 with a message."""
+    parser = argparse.ArgumentParser(prog="python -m experiments.compare", description=__doc__)
+    parser.add_argument("runs", type=Path, nargs="+", help="directories of finished runs")
+    parser.add_argument("--out", type=Path, required=True, help="directory for coverage.png and comparison.json")
+    arguments = parser.parse_args(argv)
+    try:
+        config, groups = group(arguments.runs)
+        env = make_environment(config)
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        curves = [plot.Curves(one.label, one.steps, one.coverage) for one in groups]
+        plot.plot_coverage(arguments.out / "coverage.png", curves, env.coverage, title=config.env)
+        found = {one.label: [outcome._asdict() for outcome in one.outcomes] for one in groups}
+        record = {"env": config.env, "preset": config.preset, "steps": config.steps, "methods": found}
+        (arguments.out / "comparison.json").write_text(json.dumps(record, indent=2) + "\n")
+    except RunError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except OSError as error:
+        print(f"error: {disk_error('write the comparison', arguments.out, error)}", file=sys.stderr)
+        return 1
+    print(table(groups, env.coverage.num_cells, env.coverage.unit))
+    total = sum(outcome.minutes for one in groups for outcome in one.outcomes)
+    print(f"\n{duration(60 * total)} of wall time in all; written to {arguments.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

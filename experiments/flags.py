@@ -1,0 +1,101 @@
+"""Flags from configurations: every field of a dataclass is one, with its docstring as help.
+
+The only file that knows tyro. Values are parsed here and checked by the configurations themselves, so that a bad one
+gets the same message on the command line as in a file.
+"""
+
+import ast
+import dataclasses
+import functools
+import inspect
+import textwrap
+import typing
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal, get_args, get_origin
+
+from experiments.errors import RunError
+
+try:
+    import tyro
+except ImportError as error:
+    raise RunError('the command line needs tyro. What to do: pip install -e ".[experiments]".') from error
+
+
+def parse(
+    argv: Sequence[str],
+    groups: Sequence[Any],
+    *,
+    prog: str,
+    description: str,
+    unprefixed: Sequence[str] = (),
+    choices: Mapping[str, Sequence[str]] | None = None,
+) -> list[dict[str, Any]]:
+    """Read flags.
+
+    Args:
+        argv: the words after the program's name.
+        groups: dataclasses; their values are the flags' defaults.
+        prog: the program's name.
+        description: what it does, for `--help`.
+        unprefixed: fields that are dataclasses and whose own fields are flags without the field's name before them.
+        choices: names to list in the help of a text field.
+
+    Returns:
+        The values of each of `groups`, as nested dictionaries.
+
+    Raises:
+        SystemExit: with 0 after `--help`, with 2 for an unknown flag or a value of the wrong type.
+    """
+    values = [f"group_{i}" for i in range(len(groups))]
+    mirrors = [_mirror(group, unprefixed, choices or {}, top=True) for group in groups]
+    fields = [(name, _group(mirror), mirror()) for name, mirror in zip(values, mirrors, strict=True)]
+    arguments = dataclasses.make_dataclass("Arguments", fields, frozen=True)
+    parsed = tyro.cli(arguments, prog=prog, description=description, args=list(argv))
+    return [dataclasses.asdict(getattr(parsed, name)) for name in values]
+
+
+def _group(mirror: type) -> Any:
+    return Annotated[mirror, tyro.conf.arg(name="")]
+
+
+def _mirror(config: Any, unprefixed: Sequence[str], choices: Mapping[str, Sequence[str]], *, top: bool = False) -> type:
+    """A dataclass with the fields of `config`, its values as defaults, and no checks."""
+    documents, hints = document(type(config)), typing.get_type_hints(type(config))
+    fields = []
+    for item in dataclasses.fields(config):
+        value = getattr(config, item.name)
+        if dataclasses.is_dataclass(value):
+            inner = _mirror(value, unprefixed, choices)
+            fields.append((item.name, _group(inner) if item.name in unprefixed else inner, inner()))
+            continue
+        hint, names = hints[item.name], choices.get(item.name)
+        if get_origin(hint) is Literal:
+            # As text: the configuration's own check knows the nearest match.
+            hint, names = str, get_args(hint)
+        settings: dict[str, Any] = {"help": documents.get(item.name)}
+        if names:
+            settings["metavar"] = "{" + ",".join(names) + "}"
+        if hint == str | None:
+            hint, value = str, value or ""
+            settings |= {"metavar": "PATH", "help_behavior_hint": ""}
+        elif hint is bool and top:
+            # Nobody asks for --no-version; a setting has both, whatever its default.
+            hint = tyro.conf.FlagCreatePairsOff[bool]
+            settings["help_behavior_hint"] = ""
+        fields.append((item.name, Annotated[hint, tyro.conf.arg(**settings)], value))
+    mirror = dataclasses.make_dataclass(type(config).__name__, fields, frozen=True)
+    mirror.__doc__ = type(config).__doc__
+    return mirror
+
+
+@functools.cache
+def document(config_type: type) -> dict[str, str]:
+    """The docstrings below the fields of a dataclass, each on one line."""
+    (tree,) = ast.parse(textwrap.dedent(inspect.getsource(config_type))).body
+    assert isinstance(tree, ast.ClassDef)
+    found = {}
+    for field, below in zip(tree.body, tree.body[1:], strict=False):
+        match field, below:
+            case ast.AnnAssign(target=ast.Name(name)), ast.Expr(ast.Constant(str(text))):
+                found[name] = " ".join(text.split())
+    return found
