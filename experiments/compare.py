@@ -107,7 +107,7 @@ def group(runs: Sequence[Path]) -> tuple[RunConfig, list[Group]]:
 def table(groups: Sequence[Group], num_cells: int, unit: str) -> str:
     """A Markdown table: medians, and ranges in brackets."""
     lines = [
-        f"| method | seeds | {unit} of {num_cells}: median (range) | each seed | all {num_cells} seen at step | minutes |",
+        f"| method | seeds | {unit} of {num_cells}: median (range) | each seed | all seen at step | minutes |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
     for one in groups:

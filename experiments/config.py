@@ -64,7 +64,7 @@ class RunConfig:
 
 LAPTOP = ExplorationConfig(
     dynamics=DynamicsConfig(hidden=(64, 64)),
-    svgd=SVGDConfig(temperature=0.1, tempering="per_datum"),
+    svgd=SVGDConfig(temperature=0.02, tempering="per_datum", repulsion_points="perturbed", accept_improper=True),
     fit=FitConfig(lr=1e-3, weight_decay=0.0, epochs=0, steps=60, restart=False),
     imagination=ImaginationConfig(
         horizon=25,

@@ -139,7 +139,7 @@ def make_programs(config: RunConfig, env: Environment, explorer: Explorer) -> Pr
 
 
 CollectAll: TypeAlias = Callable[[Key, Any, Any, int, bool], tuple[Any, Transition, Array]]
-"""`collect_all(keys [S], env_state, actors [S], num_steps, uniform) -> (env_state, transitions [S, T], valid [S, T])`."""
+"""`(keys [S], env_state, actors [S], num_steps, uniform) -> (env_state, transitions [S, T], valid [S, T])`."""
 
 
 def _collect_on_device(collect: Collect, act: Callable[..., Array]) -> CollectAll:
@@ -219,10 +219,9 @@ def run(config: RunConfig, out: Path, *, env: Environment | None = None, resume:
     restored = checkpoints.restore_latest(state) if resume else None
     if restored is not None:
         step, state, earlier = restored.step, restored.state, restored.meta["wall_time"]
-    metrics.truncate_after(step if restored is not None else -1)
-    board = TensorBoardLog(
-        out / "tensorboard", num_seeds=config.num_seeds, after_step=None if restored is None else step
-    )
+    last = step if restored is not None else -1
+    metrics.truncate_after(last)
+    board = TensorBoardLog(out / "tensorboard", num_seeds=config.num_seeds, after_step=last if resume else None)
     progress = Progress(config.steps, start_step=step, num_cells=env.coverage.num_cells)
     if resume:
         progress.say(f"Going on from step {step:,}" if restored else "There is no checkpoint yet: starting over")

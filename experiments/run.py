@@ -58,15 +58,16 @@ def versions() -> dict[str, str]:
 
 def use_compilation_cache() -> None:
     """Keep compiled programs in the user's own cache directory, unless JAX has been told of another."""
-    if jax.config.values["jax_compilation_cache_dir"] is None:
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        directory = Path(base) / "jaxplore" / "jax"
-        try:
-            # Compiled code is run without being checked: nobody else may write here.
-            directory.mkdir(parents=True, exist_ok=True, mode=0o700)
-        except OSError:
-            return
-        jax.config.update("jax_compilation_cache_dir", str(directory))
+    if jax.config.values["jax_compilation_cache_dir"] is not None:
+        return
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    directory = Path(base) / "jaxplore" / "jax"
+    try:
+        # Compiled code is run without being checked: nobody else may write here.
+        directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+    except OSError:
+        return
+    jax.config.update("jax_compilation_cache_dir", str(directory))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
 
 

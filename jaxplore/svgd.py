@@ -84,6 +84,8 @@ class SVGDConfig:
     """Standard deviation of the perturbation, or half-width of the box, in input units."""
     num_repulsion_points: int = 32
     """How many uniform points."""
+    accept_improper: bool = False
+    """Whether points beyond the data with a flat prior pass without a warning: you watch `repulsion_variance`."""
     redraw: Redraw = "every_step"
     """`every_step`: new noise z each update. `fixed`: one set drawn at the start (needs `self_weight=1`)."""
 
@@ -282,10 +284,11 @@ def make_amortized_svgd(
     """
     config = config or SVGDConfig()
     beyond_data = repulsion_inputs is not None or config.repulsion_points in ("perturbed", "uniform")
-    if beyond_data and config.prior == "flat":
+    if beyond_data and config.prior == "flat" and not config.accept_improper:
         warnings.warn(
             "Repulsion points beyond the data with prior='flat': no proper posterior exists there and the variance "
-            "grows without bound in a long run. Use prior='weights', or watch the metric 'repulsion_variance'.",
+            "grows without bound in a long run. Use prior='weights', or watch the metric 'repulsion_variance' and "
+            "set accept_improper.",
             UserWarning,
             stacklevel=2,
         )

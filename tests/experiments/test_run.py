@@ -1,0 +1,535 @@
+import dataclasses
+import errno
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from experiments import log, loop, run
+from experiments.checkpoint import Checkpoints
+from experiments.config import PRESETS, flag, from_json, preset_config, to_json
+from experiments.errors import RunError
+from experiments.flags import document
+from jaxplore import beliefs, methods
+from jaxplore.methods import Method
+from tests.experiments.tiny import CELLS, ROOT, STEPS, TINY, assert_same_run, leaves, rows
+
+RANDOM = ("--env=point", "--method=random", "--preset=smoke", "--steps=60", "--warm-up-steps=30")
+
+
+def parse(*words: str):
+    return run.parse(words)[1]
+
+
+def everything_in(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+# A whole run.
+
+
+def test_a_run_writes_its_metrics(finished):
+    assert finished.status == 0
+    told = rows(finished.out)
+    assert [row["step"] for row in told] == list(STEPS)
+    assert {row["seed"] for row in told} == {0}
+    for row in told:
+        assert row["coverage"] == pytest.approx(row["cells"] / 7)
+        assert ("intrinsic_reward" in row) == ("model_error" in row) == ("fit/loss" in row) == (row["step"] >= 31)
+    assert [row["cells"] for row in told] == sorted(row["cells"] for row in told)
+    assert told[0]["cells"] >= 1
+    assert {"fit/loss", "fit/variance", "policy/q_loss", "policy/imagined_reward"} <= told[-1].keys()
+    assert all(np.isfinite(value) for row in told for value in row.values())
+    times = [json.loads(line) for line in (finished.out / "metrics.jsonl").read_text().splitlines()]
+    assert all(row["wall_time"] > 0 and row["steps_per_second"] > 0 for row in times)
+
+
+def test_a_run_leaves_all_its_files_and_no_scraps(finished):
+    names = {path.name for path in finished.out.iterdir()}
+    pictures = {"coverage.png", "visitation.png", "intrinsic_reward.png"}
+    assert names == {
+        *("config.json", "versions.json", "metrics.jsonl", "walk.npz", "checkpoints", "tensorboard"),
+        *pictures,
+    }
+    assert Checkpoints(finished.out / "checkpoints").steps() == [75, 81]
+    assert len(list((finished.out / "tensorboard").glob("events.*"))) == 1
+    for picture in pictures:
+        pixels = imread(finished.out / picture)[..., :3]
+        assert pixels.shape[1] > 1000
+        assert 0.01 < (pixels.mean(-1) < 0.95).mean() < 0.9
+
+
+def test_the_walk_is_where_each_step_began(finished):
+    with np.load(finished.out / "walk.npz") as walk:
+        positions, episode_steps = walk["positions"], walk["episode_steps"]
+    assert positions.shape == (1, 81, 2)
+    np.testing.assert_array_equal(episode_steps, np.arange(81)[None])
+    # It begins near (0, 0) and takes no leaps: 0.05 s at the few m/s that an ant can do.
+    assert np.abs(positions[0, 0]).max() <= 0.1
+    assert 0 < np.abs(np.diff(positions[0], axis=0)).max() < 0.5
+
+
+def test_a_run_tells_what_it_does_and_closes_with_a_table(finished):
+    head, *_ = finished.stdout.splitlines()
+    assert head == "implicit on ant_maze: smoke preset, seed 0, 81 steps"
+    assert "physics: mujoco, learning: " in finished.stdout
+    assert f"writing to {finished.out}" in finished.stdout
+    assert re.search(r"^seed +maze cells \(of 7\) +last new at step +steps +time +steps/s$", finished.stdout, re.M)
+    assert re.search(r"^ +0 +[1-7] +\d+ +81 +", finished.stdout, re.M)
+    for name in ("metrics.jsonl", "coverage.png", "visitation.png", "intrinsic_reward.png"):
+        assert str(finished.out / name) in finished.stdout
+    assert f"python -m experiments.render {finished.out}" in finished.stdout
+    assert finished.stderr.count("Compiling the learning step") == 1
+    assert re.search(
+        r"^100% \| 81/81  cells \d/7  reward [\d.e+-]+  error [\d.e+-]+  [\d.]+ steps/s$", finished.stderr, re.M
+    )
+
+
+def test_the_saved_configuration_gives_the_same_run(finished, tell, tmp_path: Path):
+    config = from_json((finished.out / "config.json").read_text(), "config.json")
+    assert config == dataclasses.replace(parse(*TINY), backend="mujoco")
+    again = tell(tmp_path / "again", f"--config={finished.out / 'config.json'}")
+    assert again.status == 0
+    assert_same_run(finished.out, again.out)
+    assert (again.out / "config.json").read_bytes() == (finished.out / "config.json").read_bytes()
+
+
+def test_flags_come_on_top_of_a_configuration(tmp_path: Path):
+    path = tmp_path / "mine.json"
+    path.write_text('{"preset": "smoke", "explorer": {"sac": {"lr": 0.5, "alpha": 0.25}}}')
+    config = parse(f"--config={path}", "--sac.lr=0.125", "--seed", "4")
+    assert (config.preset, config.seed) == ("smoke", 4)
+    assert (config.explorer.sac.lr, config.explorer.sac.alpha) == (0.125, 0.25)
+
+
+def test_two_seeds_are_two_runs(finished, tell, tmp_path: Path):
+    one = tell(tmp_path / "one", "--seed=1", *TINY)
+    both = tell(tmp_path / "both", "--num-seeds=2", *TINY)
+    assert (one.status, both.status) == (0, 0)
+    assert [(row["step"], row["seed"]) for row in rows(both.out)] == [(step, seed) for step in STEPS for seed in (0, 1)]
+    for alone in (finished, one):
+        for row in rows(alone.out):
+            (twin,) = [
+                other for other in rows(both.out) if (other["step"], other["seed"]) == (row["step"], row["seed"])
+            ]
+            assert row.keys() == twin.keys()
+            for name in row:
+                # The last round stands on three before it, each of which magnifies rounding.
+                assert twin[name] == pytest.approx(row[name], rel=2e-3, abs=1e-4), (name, row["step"])
+    assert rows(finished.out)[-1]["intrinsic_reward"] != rows(one.out)[-1]["intrinsic_reward"]
+    assert "seeds 0 to 1" in both.stdout
+    assert re.search(r"^range ", both.stdout, re.M)
+
+
+def test_a_method_without_a_belief(tell, point: str, tmp_path: Path):
+    told = tell(tmp_path / "run", *RANDOM)
+    assert told.status == 0
+    assert "random on point" in told.stdout
+    assert "physics: jax" in told.stdout
+    assert "experiments.render" not in told.stdout, "a point has no looks"
+    last = rows(told.out)[-1]
+    assert set(last) == {"step", "seed", "coverage", "cells"}
+    with np.load(told.out / "walk.npz") as walk:
+        positions = walk["positions"][0]
+        np.testing.assert_array_equal(walk["episode_steps"][0], np.arange(60) % 20)
+    seen = sum(
+        bool(np.any(np.all((positions >= (x0, y0)) & (positions < (x1, y1)), axis=-1))) for x0, y0, x1, y1 in CELLS
+    )
+    assert last["cells"] == seen
+
+
+def test_a_run_shorter_than_its_pictures_have_panels(tell, point: str, tmp_path: Path):
+    told = tell(tmp_path / "run", "--env=point", "--method=random", "--warm-up-steps=1", "--steps=2")
+    assert told.status == 0
+    assert (told.out / "visitation.png").exists()
+
+
+def test_without_out_a_run_makes_its_own_place(point: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    config, command = parse("--env=point", "--method=random", "--seed=3"), run.CommandLine()
+    assert run.choose_directory(command, config) == Path("runs/point-random-laptop-seed3")
+    (tmp_path / "runs/point-random-laptop-seed3").mkdir(parents=True)
+    assert run.choose_directory(command, config) == Path("runs/point-random-laptop-seed3-2")
+
+
+# Flags.
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--env=ant_maze", "--num-seeds=2", "--sac.batch-size=64"),
+        ("--env", "ant_maze", "--num_seeds", "2", "--sac.batch_size", "64"),
+    ],
+)
+def test_flags_with_hyphens_and_underscores_and_spaces(words: tuple[str, ...]):
+    config = parse(*words)
+    assert (config.env, config.num_seeds, config.explorer.sac.batch_size) == ("ant_maze", 2, 64)
+
+
+def test_flags_of_every_type():
+    config = parse(
+        *("--preset", "paper", "--sac.lr", "1e-2", "--svgd.self-weight", "0.5", "--svgd.kernel", "imq"),
+        *("--dynamics.hidden", "16", "8", "--fit.no-restart", "--imagination.normalize-reward", "--backend=mjx"),
+    )
+    explorer = config.explorer
+    assert (config.preset, config.backend, config.obs_noise) == ("paper", "mjx", 0.02)
+    assert (explorer.sac.lr, explorer.svgd.self_weight, explorer.svgd.kernel) == (0.01, 0.5, "imq")
+    assert (explorer.dynamics.hidden, explorer.fit.restart) == ((16, 8), False)
+    assert explorer.imagination.normalize_reward
+    assert explorer.sac.batch_size == 4096
+
+
+def leaf_fields(config: Any, prefix: str = ""):
+    for item in dataclasses.fields(config):
+        value = getattr(config, item.name)
+        if dataclasses.is_dataclass(value):
+            yield from leaf_fields(value, f"{prefix}{item.name}.")
+        else:
+            yield f"{prefix}{item.name}", value, document(type(config))[item.name]
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_help_shows_every_setting_with_its_default(
+    preset: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setenv("COLUMNS", "100")
+    with pytest.raises(SystemExit) as stop:
+        run.main([f"--preset={preset}", "--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    assert max(map(len, text.splitlines())) <= 100
+    plain = " ".join(re.sub(r"[│╭╮╰╯─]", " ", text).split())
+    for path, value, help_text in leaf_fields(preset_config(preset)):
+        name = flag(path)
+        shown = " ".join(map(str, value)) if isinstance(value, tuple) else value
+        entry = plain[re.search(rf"{re.escape(name)}[ ,]", plain).start() :].split("(default: ")
+        assert " ".join(help_text.split()) in entry[0], name
+        assert entry[1].startswith(f"{shown})"), name
+    for name in ("--out PATH", "--resume ", "--config PATH", "--version "):
+        assert name in plain
+    assert "--env {ant_maze}" in plain
+    assert "--method {implicit,random}" in plain
+    assert "--svgd.kernel {rbf,imq}" in plain
+    assert "explorer" not in plain
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--env=ant_mase", r"env='ant_mase' is not known\. Did you mean 'ant_maze'\? Allowed: ant_maze"),
+        ("--method=implict", r"--method='implict' is not known\. Did you mean 'implicit'\? Allowed: implicit, random"),
+        ("--preset=papre", r"preset='papre' is not known\. Did you mean 'paper'\? Allowed: laptop, paper, smoke"),
+        ("--backend=mjy", r"backend is 'mjy'\. Did you mean 'mjx'\? Allowed: auto, mjx, mujoco"),
+        ("--svgd.kernel=rbff", r"--svgd\.kernel='rbff' is not known\. Did you mean 'rbf'\? Allowed: imq, rbf"),
+        ("--sac.activation=rleu", r"--sac\.activation='rleu' is not known\. Did you mean 'relu'\? Allowed: leaky_relu"),
+        ("--num-seeds=0", r"--num-seeds=0 is out of range\. Allowed: a whole number, 1 or more"),
+        ("--obs-noise=-1", r"--obs-noise=-1\.0 is out of range\. Allowed: a finite number in \[0, inf\)"),
+        ("--sac.lr=-1", r"--sac\.lr=-1\.0 is out of range\. Allowed: a finite number in \(0, inf\)"),
+        ("--sac.discount=nan", r"--sac\.discount=nan is out of range"),
+        ("--imagination.real-fraction=2", r"--imagination\.real-fraction=2\.0 is out of range"),
+        ("--steps=9", r"--steps=9 ends within the random steps at the start\. Allowed: at least warm_up_steps=256"),
+        ("--resume", r"--resume needs --out"),
+        ("--resume --out=none", r"--out=none is not there"),
+        ("--config=none.json", r"cannot read the configuration none\.json: .*No such file"),
+        ("--sead=1", r"Unrecognized options: --sead=1[\s\S]*Perhaps you meant:[\s\S]*--seed INT"),
+        ("--sac.lrr=1", r"Unrecognized options: --sac\.lrr=1[\s\S]*--sac\.lr FLOAT"),
+        ("--seed=one", r"--seed: .*'one'"),
+        ("--sac.lr", r"--sac\.lr"),
+    ],
+)
+def test_bad_flags_are_refused_and_nothing_is_written(
+    words: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
+    try:
+        status = run.main(words.split())
+    except SystemExit as stop:
+        status = stop.code
+    assert status == 2
+    told = capsys.readouterr()
+    assert re.search(message, told.err)
+    assert told.out == ""
+    assert everything_in(tmp_path) == []
+
+
+def test_preset_and_configuration_must_agree(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    path = tmp_path / "c.json"
+    path.write_text(to_json(preset_config("smoke")))
+    assert run.main([f"--config={path}", "--preset=paper", f"--out={tmp_path / 'run'}"]) == 2
+    assert re.search(r"--preset=paper disagrees with .*c\.json, which has 'smoke'", capsys.readouterr().err)
+    path.write_bytes(b"\xff")
+    assert run.main([f"--config={path}"]) == 2
+    assert str(path) in capsys.readouterr().err
+    assert everything_in(tmp_path) == ["c.json"]
+
+
+def test_versions_are_told(capsys: pytest.CaptureFixture[str]):
+    assert run.main(["--version"]) == 0
+    told = dict(line.split(" ", 1) for line in capsys.readouterr().out.splitlines())
+    assert told["python"] == ".".join(map(str, sys.version_info[:3]))
+    assert {"jaxplore", "jax", "mujoco", "mujoco-mjx"} <= told.keys()
+    assert "not installed" not in told.values()
+
+
+def test_the_module_is_a_program_with_an_exit_status(tmp_path: Path):
+    command = [sys.executable, "-m", "experiments.run", "--method=implict", f"--out={tmp_path / 'run'}"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: --method='implict' is not known. Did you mean 'implicit'?")
+    assert len(done.stderr.splitlines()) == 1, "and nothing else: no warnings, no traceback"
+    assert everything_in(tmp_path) == []
+
+
+# The place of a run.
+
+
+@pytest.fixture
+def small(tell, point: str, tmp_path: Path):
+    """A finished run of random actions that may be written to."""
+    told = tell(tmp_path / "run", *RANDOM)
+    assert told.status == 0
+    return told
+
+
+def test_another_run_is_not_overwritten(small, tell):
+    before = {path: path.read_bytes() for path in small.out.rglob("*") if path.is_file()}
+    told = tell(small.out, *RANDOM)
+    assert told.status == 2
+    assert f"--out={small.out} holds another run. Give another directory, or --resume" in told.stderr
+    assert {path: path.read_bytes() for path in small.out.rglob("*") if path.is_file()} == before
+
+
+def test_other_files_are_not_mixed_with_a_run(tell, point: str, tmp_path: Path):
+    (tmp_path / "thesis.txt").write_text("")
+    assert "holds other files" in tell(tmp_path, *RANDOM).stderr
+    told = tell(tmp_path, "--resume", *RANDOM)
+    assert told.status == 2
+    assert "holds no run (no config.json)" in told.stderr
+    assert everything_in(tmp_path) == ["thesis.txt"]
+
+
+def test_an_empty_directory_is_taken(tell, point: str, tmp_path: Path):
+    assert tell(tmp_path, *RANDOM).status == 0
+
+
+def test_a_run_killed_while_it_started_can_be_resumed(small, tell, tmp_path: Path):
+    out = tmp_path / "killed"
+    out.mkdir()
+    (out / "versions.json").write_text("{}")
+    (out / "config.json.tmp").write_text("{")
+    told = tell(out, "--resume", *RANDOM)
+    assert told.status == 0
+    assert "There is no checkpoint yet: starting over" in told.stderr
+    assert rows(out) == rows(small.out)
+
+
+def test_resume_with_another_configuration_names_the_differences(small, tell):
+    told = tell(small.out, "--resume", "--seed=4", "--sac.lr=0.5", "--method=implicit")
+    assert told.status == 2
+    assert (
+        f"--resume: the configuration disagrees with {small.out / 'config.json'} in method: 'random' -> 'implicit'; "
+        "seed: 0 -> 4; sac.lr: 0.001 -> 0.5. Resume with the saved values, or start a run in another --out."
+    ) in told.stderr
+
+
+def test_resume_of_a_finished_run_draws_it_again(small, tell):
+    (small.out / "coverage.png").unlink()
+    before = {path: path.read_bytes() for path in small.out.rglob("*") if path.is_file() and path.suffix != ".png"}
+    told = tell(small.out, "--resume")
+    assert told.status == 0
+    assert f"The run in {small.out} is finished: drawing it again." in told.stdout
+    assert told.stdout.split("\n\n", 1)[1] == small.stdout.split("\n\n", 1)[1], "the same table"
+    assert (small.out / "coverage.png").exists()
+    after = {path: path.read_bytes() for path in small.out.rglob("*") if path.is_file() and path.suffix != ".png"}
+    assert after == before
+
+
+def test_resume_says_when_versions_have_changed(small, tell):
+    found = json.loads((small.out / "versions.json").read_text())
+    (small.out / "versions.json").write_text(json.dumps({**found, "jax": "0.1"}))
+    told = tell(small.out, "--resume")
+    assert told.status == 0
+    assert f"Versions have changed, so not to the bit: jax: 0.1 -> {found['jax']}" in told.stderr
+
+
+def test_a_damaged_walk_is_named(small, tell):
+    (small.out / "walk.npz").write_bytes(b"PK")
+    told = tell(small.out, "--resume")
+    assert told.status == 1
+    assert str(small.out / "walk.npz") in told.stderr
+    assert "remove it, and finish with --resume" in told.stderr
+    (small.out / "walk.npz").unlink()
+    assert tell(small.out, "--resume").status == 0
+
+
+# A run that fails.
+
+
+def test_a_place_that_cannot_be_written_is_named(tell, point: str, tmp_path: Path):
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path / "file", tmp_path / "file" / "run"):
+        told = tell(out, *RANDOM)
+        assert told.status == 1
+        assert f"error: cannot start the run in {out}: " in told.stderr
+        assert "a file stands where a directory is needed" in told.stderr
+    assert everything_in(tmp_path) == ["file"]
+
+
+def test_a_place_that_cannot_be_read_is_named(tell, point: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def refuse(self: Path):
+        raise PermissionError(errno.EACCES, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    told = tell(tmp_path, *RANDOM)
+    assert told.status == 2
+    assert f"error: cannot look for a run in {tmp_path}: Permission denied" in told.stderr
+
+
+def full_disk(*_: Any, **__: Any):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize("what", ["metrics", "checkpoint", "walk", "picture"])
+def test_a_full_disk_ends_the_run_and_spares_the_last_checkpoint(
+    what: str, finished, tell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    """Of the ant, for all that a real checkpoint holds."""
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        if what == "metrics":
+            original = log.MetricsLog.append
+
+            def append(self, told):
+                if told[0]["step"] == 75:
+                    patch.setattr(os, "write", full_disk)
+                original(self, told)
+
+            patch.setattr(log.MetricsLog, "append", append)
+        elif what == "checkpoint":
+            save = Checkpoints.save
+
+            def save_until_full(self, step, *rest):
+                if step == 75:
+                    patch.setattr(os, "fsync", full_disk)
+                save(self, step, *rest)
+
+            patch.setattr(Checkpoints, "save", save_until_full)
+        elif what == "walk":
+            patch.setattr(np, "savez_compressed", full_disk)
+        else:
+            patch.setattr("matplotlib.figure.Figure.savefig", full_disk)
+        told = tell(out, *TINY)
+    assert told.status == 1
+    (line,) = [line for line in told.stderr.splitlines() if line.startswith("error: ")]
+    assert re.search(rf"cannot .* in {re.escape(str(out))}.*: No space left on device\. What to do: free some", line)
+    assert "Traceback" not in told.stderr
+    last = Checkpoints(out / "checkpoints").steps()[-1]
+    assert last == {"metrics": 50, "checkpoint": 50, "walk": 81, "picture": 81}[what]
+    leaves(out, last)
+    assert not (out / "walk.npz").exists() or what == "picture"
+    assert tell(out, "--resume").status == 0
+    assert_same_run(finished.out, out)
+    assert not list(out.rglob("*.tmp*"))
+
+
+def test_ctrl_c_says_how_to_go_on(tell, point: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    out = tmp_path / "a run"
+
+    def interrupt(*_: Any):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(log.Progress, "update", interrupt)
+        told = tell(out, *RANDOM)
+    assert told.status == 130
+    (line,) = [line for line in told.stderr.splitlines() if line.startswith("Stopped.")]
+    words = shlex.split(line.partition("experiments.run ")[2])
+    assert words == [f"--out={out}", "--resume"]
+    assert "Traceback" not in told.stderr
+    assert tell(out, *words[1:]).status == 0
+
+
+def test_an_error_in_the_program_is_not_taken_for_bad_input(
+    tell, point: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def broken(*_: Any):
+        raise ValueError("a bug")
+
+    monkeypatch.setattr(loop, "_rows", broken)
+    with pytest.raises(ValueError, match="a bug"):
+        tell(tmp_path / "run", *RANDOM)
+
+
+@pytest.mark.parametrize("breaks", ["metric", "state"])
+def test_numbers_that_are_not_finite_end_the_run(
+    breaks: str, tell, point: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    def belief(sizes, config):
+        def update(key, state, data, normalizers):
+            # Seed 1 alone breaks, once 50 steps have come; seed 0 must be taken back with it.
+            bad = jnp.where((data.size >= 50) & (state["seed"] > 0), jnp.inf, 0.0)
+            told = {"loss": 1.0 + (bad if breaks == "metric" else 0.0)}
+            return {**state, "value": state["value"] + 1.0 + (bad if breaks == "state" else 0.0)}, told
+
+        def init(key):
+            return {"value": jnp.zeros(()), "seed": jnp.zeros(())}
+
+        return beliefs.Belief(init, update, lambda key, state, num: (), None)
+
+    monkeypatch.setitem(
+        methods.METHODS, "fragile", Method("breaks", belief, methods.no_reward, methods.uniform_actions)
+    )
+    original = loop.make_programs
+
+    def make_programs(config, env, explorer):
+        programs = original(config, env, explorer)
+
+        def init():
+            state = programs.init()
+            own = {**state.explorer.belief, "seed": jnp.arange(2.0)}
+            return dataclasses.replace(state, explorer=dataclasses.replace(state.explorer, belief=own))
+
+        return programs._replace(init=init)
+
+    monkeypatch.setattr(loop, "make_programs", make_programs)
+    out = tmp_path / "run"
+    told = tell(out, "--env=point", "--method=fragile", "--num-seeds=2", *TINY)
+    assert told.status == 1
+    quantity = {"metric": "fit/loss", "state": "the state of the belief"}[breaks]
+    assert (
+        f"error: the round of steps 31 to 50 came out with numbers that are not finite: {quantity} (seed 1). "
+        f"The state before it is saved in {out / 'checkpoints'}. What to do: "
+    ) in told.stderr
+    assert "smaller --fit.lr" in told.stderr
+    assert [row["step"] for row in rows(out)] == [25, 25, 31, 31]
+    assert Checkpoints(out / "checkpoints").steps()[-1] == 31
+    saved = leaves(out, 31)
+    sizes, values = (
+        np.frombuffer(saved[name][3], dtype)
+        for name, dtype in (("explorer.data.size", np.int32), ("explorer.belief.value", np.float32))
+    )
+    np.testing.assert_array_equal(sizes, [31, 31])
+    np.testing.assert_array_equal(values, [2.0, 2.0])
+    assert tell(out, "--resume").stderr.count("steps 31 to 50 came out") == 1
+
+
+def test_numbers_are_looked_at_by_name():
+    with pytest.raises(RunError, match=r"a, c \(seed 6\)"):
+        raise loop._diverged(
+            {"a": np.array([True, False]), "b": np.array([True, True]), "c": np.array([True, False])},
+            dataclasses.replace(preset_config("smoke"), seed=5, num_seeds=2),
+            50,
+            75,
+            Path("run"),
+        )
