@@ -65,12 +65,12 @@ class RunConfig:
 LAPTOP = ExplorationConfig(
     dynamics=DynamicsConfig(hidden=(64, 64)),
     svgd=SVGDConfig(temperature=0.02, tempering="per_datum", repulsion_points="perturbed", accept_improper=True),
-    fit=FitConfig(lr=1e-3, weight_decay=0.0, epochs=0, steps=60, restart=False),
+    fit=FitConfig(lr=1e-3, weight_decay=0.0, batch_size=128, epochs=0, steps=60, restart=False),
     imagination=ImaginationConfig(
         horizon=25,
         num_rollouts=1,
         num_random_rollouts=0,
-        updates_per_rollout=400,
+        updates_per_rollout=300,
         real_updates=0,
         current_fraction=0.5,
         mover="per_rollout",
