@@ -63,10 +63,7 @@ def _result(kernel: str, shape: str, timing: Timing, flop: float | None = None, 
 def environment_steps(backend: str, num_envs: int, steps: int) -> Result:
     """Random actions in the Ant maze: C MuJoCo one after the other, MJX under `vmap`."""
     env = envs.make("ant_maze", backend=backend)
-    if env.compiled:
-        call = _mjx_steps(env, num_envs, steps)
-    else:
-        call = _host_steps(env, steps)
+    call = _mjx_steps(env, num_envs, steps) if env.compiled else _host_steps(env, steps)
     timing = measure(call, repeats=3, inner=steps * num_envs)
     name = f"environment step, {'MJX' if env.compiled else 'C MuJoCo'}"
     result = _result(name, f"{num_envs} in parallel", timing)
@@ -223,7 +220,8 @@ def whole_round(run: RunConfig, rate: float, num_data: int, repeats: int) -> Res
         * flops.imagined_step(widths, policy, settings.num_models, settings.num_actors)
         + updates * flops.sac_update(OBS, ACTION, config.sac.hidden, config.sac.batch_size)
     )
-    shape = f"{run.preset}, N = {num_data:,}: {steps} SVGD, {settings.num_rollouts * settings.horizon} imagined, {updates} SAC"
+    imagined = settings.num_rollouts * settings.horizon
+    shape = f"{run.preset}, N = {num_data:,}: {steps} SVGD, {imagined} imagined, {updates} SAC"
     return _result("whole round", shape, timing, flop, rate)
 
 

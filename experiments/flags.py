@@ -6,11 +6,12 @@ gets the same message on the command line as in a file.
 
 import ast
 import dataclasses
+import difflib
 import functools
 import inspect
 import textwrap
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 from experiments.errors import RunError
@@ -44,14 +45,30 @@ def parse(
         The values of each of `groups`, as nested dictionaries.
 
     Raises:
-        SystemExit: with 0 after `--help`, with 2 for an unknown flag or a value of the wrong type.
+        ValueError: a flag that does not exist, naming the nearest.
+        SystemExit: with 0 after `--help`, with 2 for a value of the wrong type.
     """
-    values = [f"group_{i}" for i in range(len(groups))]
+    names = [f"group_{i}" for i in range(len(groups))]
     mirrors = [_mirror(group, unprefixed, choices or {}, top=True) for group in groups]
-    fields = [(name, _group(mirror), mirror()) for name, mirror in zip(values, mirrors, strict=True)]
+    fields = [(name, _group(mirror), mirror()) for name, mirror in zip(names, mirrors, strict=True)]
     arguments = dataclasses.make_dataclass("Arguments", fields, frozen=True)
-    parsed = tyro.cli(arguments, prog=prog, description=description, args=list(argv))
-    return [dataclasses.asdict(getattr(parsed, name)) for name in values]
+    parsed, unknown = tyro.cli(arguments, prog=prog, description=description, args=list(argv), return_unknown_args=True)
+    for word in unknown:
+        name = word.partition("=")[0].replace("_", "-")
+        nearest = difflib.get_close_matches(name, [flag for group in groups for flag in _flags(group, unprefixed)], n=1)
+        hint = f" Did you mean {nearest[0]}?" if nearest else ""
+        raise ValueError(f"{word} is not known.{hint} Allowed: what {prog} --help lists.")
+    return [dataclasses.asdict(getattr(parsed, name)) for name in names]
+
+
+def _flags(config: Any, unprefixed: Sequence[str], prefix: str = "--") -> Iterator[str]:
+    """The flags of a dataclass's fields."""
+    for item in dataclasses.fields(config):
+        value, name = getattr(config, item.name), item.name.replace("_", "-")
+        if dataclasses.is_dataclass(value):
+            yield from _flags(value, unprefixed, prefix if item.name in unprefixed else f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}"
 
 
 def _group(mirror: type) -> Any:

@@ -4,6 +4,7 @@ A behaviour is a named tuple of pure functions. `improve` learns from a belief a
 action for the real environment.
 """
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, get_args
@@ -164,7 +165,7 @@ def make_imagination(
 
         num_chunks = (jnp.minimum(experience.num_data, capacity) + LABEL_CHUNK - 1) // LABEL_CHUNK
         rewards = jax.lax.fori_loop(0, num_chunks, chunk, jnp.zeros(capacity))
-        return data.replace(rows=data.rows._replace(reward=rewards))
+        return dataclasses.replace(data, rows=data.rows._replace(reward=rewards))
 
     def train(
         key: Key,
@@ -289,9 +290,8 @@ def make_imagination(
 
 def _no_metrics(learner: Learner, obs_size: int, action_size: int) -> Metrics:
     """Zeros in the shape of the learner's metrics, to start a loop with."""
-    flag = jax.ShapeDtypeStruct((1,), jnp.bool_)
-    obs, scalar = jax.ShapeDtypeStruct((1, obs_size), jnp.float32), jax.ShapeDtypeStruct((1,), jnp.float32)
-    batch = Transition(obs, jax.ShapeDtypeStruct((1, action_size), jnp.float32), scalar, obs, flag, flag)
+    flag, obs = jnp.zeros(1, bool), jnp.zeros((1, obs_size))
+    batch = Transition(obs, jnp.zeros((1, action_size)), jnp.zeros(1), obs, flag, flag)
     key = jax.random.key(0)
     shapes = jax.eval_shape(lambda rows: learner.update(key, learner.init(key), rows)[1], batch)
     return jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), shapes)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from jaxplore import dynamics, replay
+from jaxplore import dynamics, networks, replay
 from jaxplore.dynamics import DynamicsConfig, Normalizers, Prediction
 from jaxplore.generator import GeneratorConfig, make_generator
 from jaxplore.replay import Replay
@@ -120,7 +120,7 @@ def make_generator_belief(
     generator = make_generator(example, generator_config)
 
     def apply(params: Any, inputs: Array) -> Array:
-        return network.apply({"params": params}, inputs)
+        return networks.apply(network, params, inputs)
 
     posterior = make_amortized_svgd(generator, apply, obs_size, make_optimizer(fit_config), svgd_config)
 

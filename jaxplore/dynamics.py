@@ -53,7 +53,19 @@ class Normalizers:
 
 
 def make_network(config: DynamicsConfig, obs_size: int) -> MLP:
-    """One deterministic dynamics network, `[..., O + A] -> [..., O]`, He and LeCun initialised."""
+    """One deterministic dynamics network, `[..., O + A] -> [..., O]`, He and LeCun initialised.
+
+    Example:
+        One step of a network on its own, from raw observations to raw observations:
+
+        >>> import jax, jax.numpy as jnp
+        >>> network = make_network(DynamicsConfig(hidden=(16,)), obs_size=3)
+        >>> params = network.init(jax.random.key(0), jnp.zeros(4))["params"]
+        >>> obs, action, normalizers = jnp.ones((7, 3)), jnp.zeros((7, 1)), init_normalizers(3, 1)
+        >>> delta = network.apply({"params": params}, model_inputs(normalizers, obs, action))
+        >>> apply_delta(normalizers, obs, delta).shape
+        (7, 3)
+    """
     return MLP(config.hidden, obs_size, config.activation, "he", "lecun")
 
 

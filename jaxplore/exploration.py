@@ -4,6 +4,7 @@ A round takes in the transitions since the last one, fits the belief, draws mode
 behaviour in what they imagine. Nothing here knows which method it runs.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -91,13 +92,15 @@ def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Ex
         return behaviour.actor(state.behaviour), state.normalizers
 
     def act(key: Key, actor: Any, obs: Array) -> Array:
-        return behaviour.act(key, *actor, obs)
+        behaviour_actor, normalizers = actor
+        return behaviour.act(key, behaviour_actor, normalizers, obs)
 
     def act_uniformly(key: Key, obs: Array) -> Array:
         return jax.random.uniform(key, (*obs.shape[:-1], sizes.action), minval=-1.0, maxval=1.0)
 
     def observe(state: ExplorerState, transitions: Transition, valid: Array) -> ExplorerState:
-        return state.replace(
+        return dataclasses.replace(
+            state,
             data=replay.add(state.data, transitions, valid),
             normalizers=dynamics.update_normalizers(state.normalizers, transitions, valid),
         )
@@ -119,7 +122,7 @@ def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Ex
         models = belief.sample(models_key, fitted, config.imagination.num_models)
         experience = Experience(models, state.data, num_data, state.normalizers, obs)
         improved, metrics = behaviour.improve(improve_key, state.behaviour, experience)
-        return state.replace(belief=fitted, behaviour=improved), {
+        return dataclasses.replace(state, belief=fitted, behaviour=improved), {
             **{f"fit/{name}": value for name, value in fit_metrics.items()},
             **{f"policy/{name}": value for name, value in metrics.items()},
         }

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxplore.networks import MLP
+from jaxplore.networks import MLP, apply
 from jaxplore.types import Array, Key, Params
 from jaxplore.validate import Checks
 
@@ -137,7 +137,7 @@ def make_generator(example: Params, config: GeneratorConfig | None = None) -> Ge
     def generate(eta: Params, z: Array) -> Params:
         generated: list[Array | None] = [None] * len(leaves)
         for number, (name, indices) in enumerate(layers.items()):
-            flat = networks[name].apply({"params": eta[name]}, z if config.noise == "shared" else z[number])
+            flat = apply(networks[name], eta[name], z if config.noise == "shared" else z[number])
             offset = 0
             for i in indices:
                 generated[i] = flat[offset : offset + leaves[i].size].reshape(leaves[i].shape)

@@ -4,7 +4,7 @@ Every network is unbatched-friendly: leading axes of the input pass through.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import distrax
 import flax.linen as nn
@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxplore import validate
-from jaxplore.types import Array, Key
+from jaxplore.types import Array, Key, Params
 
 ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
     "relu": nn.relu,
@@ -121,12 +121,18 @@ def sample_tanh_gaussian(key: Key, params: GaussianParams) -> tuple[Array, Array
     squashed = distrax.Transformed(gaussian, distrax.Block(distrax.Tanh(), 1))
     # distrax adds its sample axis by rank promotion; callers may have forbidden that.
     with jax.numpy_rank_promotion("allow"):
-        return squashed.sample_and_log_prob(seed=key)
+        action, log_prob = squashed.sample_and_log_prob(seed=key)
+    return jnp.asarray(action), jnp.asarray(log_prob)
 
 
 def tanh_mean(params: GaussianParams) -> Array:
     """The deterministic action `[..., A]`: the squashed mean of the Gaussian (not the mean of the squashed one)."""
     return jnp.tanh(params.mean)
+
+
+def apply(network: nn.Module, params: Params, *inputs: Array) -> Any:
+    """What a network with these parameters makes of its inputs."""
+    return network.apply({"params": params}, *inputs)
 
 
 def count_params(params: object) -> int:

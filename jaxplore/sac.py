@@ -18,7 +18,9 @@ from jaxplore.networks import (
     ACTIVATIONS,
     INITIALIZERS,
     MLP,
+    GaussianParams,
     TanhGaussianPolicy,
+    apply,
     sample_tanh_gaussian,
     tanh_mean,
 )
@@ -119,7 +121,7 @@ def make_sac(obs_size: int, action_size: int, config: SACConfig | None = None) -
         >>> state = sac.init(jax.random.key(0))
         >>> obs, flag = jnp.ones((8, 3)), jnp.zeros(8, bool)
         >>> batch = Transition(obs, jnp.zeros((8, 1)), jnp.ones(8), obs, flag, flag)
-        >>> state, metrics = sac.update(jax.random.key(1), state, batch)
+        >>> state, metrics = jax.jit(sac.update)(jax.random.key(1), state, batch)
         >>> sac.act_greedily(sac.actor(state), obs[0]).shape
         (1,)
     """
@@ -132,13 +134,13 @@ def make_sac(obs_size: int, action_size: int, config: SACConfig | None = None) -
     def apply_q(params: Params, obs: Array, action: Array) -> Array:
         """Both action values, `[2, B]`."""
         inputs = jnp.concatenate([obs, action], axis=-1)
-        return jax.vmap(lambda one: value.apply({"params": one}, inputs)[..., 0])(params)
+        return jax.vmap(lambda one: apply(value, one, inputs)[..., 0])(params)
 
     def apply_v(params: Params, obs: Array) -> Array:
-        return value.apply({"params": params}, obs)[..., 0]
+        return apply(value, params, obs)[..., 0]
 
-    def apply_policy(params: Params, obs: Array):
-        return policy.apply({"params": params}, obs)
+    def apply_policy(params: Params, obs: Array) -> GaussianParams:
+        return apply(policy, params, obs)
 
     def init(key: Key) -> SACState:
         policy_key, q_key, v_key = jax.random.split(key, 3)
@@ -185,7 +187,7 @@ def make_sac(obs_size: int, action_size: int, config: SACConfig | None = None) -
     def update(key: Key, state: SACState, batch: Transition) -> tuple[SACState, Metrics]:
         gradient, metrics = jax.grad(loss, has_aux=True)(state.params, key, state.target_v, batch)
         steps, opt_state = optimizer.update(gradient, state.opt_state, state.params)
-        params = optax.apply_updates(state.params, steps)
+        params: Params = optax.apply_updates(state.params, steps)
         target_v = optax.incremental_update(params["v"], state.target_v, config.tau)
         return SACState(params, target_v, opt_state), metrics
 

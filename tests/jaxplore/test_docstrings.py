@@ -13,7 +13,8 @@ MODULES = sorted(f"jaxplore.{module.name}" for module in pkgutil.iter_modules(ja
 FACTORIES = sorted(
     name
     for name in jaxplore.__all__
-    if inspect.isfunction(getattr(jaxplore, name)) and (name.startswith("make_") or name in ("rollout", "stein_direction"))
+    if inspect.isfunction(getattr(jaxplore, name))
+    and (name.startswith("make_") or name in ("rollout", "stein_direction"))
 )
 
 

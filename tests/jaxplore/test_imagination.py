@@ -9,7 +9,7 @@ from jaxplore.dynamics import Normalizers, Prediction
 from jaxplore.imagination import rollout
 from jaxplore.normalizer import Normalizer
 
-M, N, O, A, H = 3, 4, 2, 1, 6
+M, N, O, A, H = 3, 4, 2, 1, 6  # noqa: E741
 RNG = np.random.default_rng(0)
 MODELS = (0.5 * RNG.normal(size=(M, O, O + A))).astype(np.float32)
 GAIN = np.array([[0.4], [-0.3]], np.float32)
@@ -42,7 +42,16 @@ def reward(prediction, delta, normalizers):
 def imagine(mover="per_step", bound=0.0, horizon=H, start=START, seed=0, act=act, models=MODELS):
     """As NumPy arrays."""
     rows = rollout(
-        jax.random.key(seed), act, predict, reward, jnp.asarray(models), NORMALIZERS, jnp.asarray(start), horizon, mover, bound
+        jax.random.key(seed),
+        act,
+        predict,
+        reward,
+        jnp.asarray(models),
+        NORMALIZERS,
+        jnp.asarray(start),
+        horizon,
+        mover,
+        bound,
     )
     return jax.tree.map(np.asarray, rows)
 

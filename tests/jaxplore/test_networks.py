@@ -118,7 +118,9 @@ def test_mlp_is_its_formula():
     assert count_params(params) == 3 * 5 + 5 + 5 * 2 + 2
 
 
-@pytest.mark.parametrize(("init", "want"), [("he", 2 / 200), ("lecun", 1 / 200), ("xavier", 2 / 300), ("orthogonal", None)])
+@pytest.mark.parametrize(
+    ("init", "want"), [("he", 2 / 200), ("lecun", 1 / 200), ("xavier", 2 / 300), ("orthogonal", None)]
+)
 def test_initialisers_have_the_variance_of_their_name(init, want):
     # He 2 / in, LeCun 1 / in, Xavier 2 / (in + out); orthogonal: columns of length 1 at right angles
     params = MLP((100,), 1, init_name=init).init(jax.random.key(0), jnp.zeros(200))["params"]
@@ -132,7 +134,7 @@ def test_initialisers_have_the_variance_of_their_name(init, want):
 
 def test_unknown_names_are_refused():
     # with the nearest match
-    with pytest.raises(ValueError, match="activation='leakyrelu' .*Did you mean 'leaky_relu'"):
+    with pytest.raises(ValueError, match=r"activation='leakyrelu' .*Did you mean 'leaky_relu'"):
         MLP((4,), 1, activation="leakyrelu")
-    with pytest.raises(ValueError, match="output_init_name='lecunn' .*Did you mean 'lecun'"):
+    with pytest.raises(ValueError, match=r"output_init_name='lecunn' .*Did you mean 'lecun'"):
         MLP((4,), 1, output_init_name="lecunn")

@@ -50,7 +50,12 @@ def fit(config, x, y, steps, seeds=4, lr=1e-2, batch_size=None, num_data=None, *
     Without `batch_size` each step sees all data. All results have a leading axis of seeds.
     """
     posterior = make_amortized_svgd(
-        linear_generator(x.shape[1]), linear_apply, 1, optax.adam(optax.cosine_decay_schedule(lr, steps)), config, **kwargs
+        linear_generator(x.shape[1]),
+        linear_apply,
+        1,
+        optax.adam(optax.cosine_decay_schedule(lr, steps)),
+        config,
+        **kwargs,
     )
     num_data = num_data or len(x)
 
@@ -69,7 +74,9 @@ def fit(config, x, y, steps, seeds=4, lr=1e-2, batch_size=None, num_data=None, *
 
         init_key, steps_key = jax.random.split(key)
         start = (posterior.init(init_key), jnp.zeros((x.shape[1], x.shape[1])), jnp.zeros(x.shape[1]))
-        (state, covariance, mean), stds = jax.lax.scan(step, start, (jnp.arange(steps), jax.random.split(steps_key, steps)))
+        (state, covariance, mean), stds = jax.lax.scan(
+            step, start, (jnp.arange(steps), jax.random.split(steps_key, steps))
+        )
         return covariance, mean, state, stds
 
     return jax.jit(jax.vmap(one_seed))(jax.random.split(jax.random.key(0), seeds))

@@ -28,7 +28,12 @@ def test_variance_is_numpys():
 
 @pytest.mark.parametrize(
     ("change", "factor"),
-    [(lambda x: x[::-1], 1.0), (lambda x: x + np.float32(3.0), 1.0), (lambda x: -2 * x, 4.0), (lambda x: x[[0] * 7], 0.0)],
+    [
+        (lambda x: x[::-1], 1.0),
+        (lambda x: x + np.float32(3.0), 1.0),
+        (lambda x: -2 * x, 4.0),
+        (lambda x: x[[0] * 7], 0.0),
+    ],
     ids=["permuted", "shifted", "scaled", "one model"],
 )
 def test_variance_under_changes_of_the_models(change, factor):

@@ -260,7 +260,9 @@ def one_step(config, x, y, num_data, optimizer=None, **kwargs):
     """Flat eta after one update, the start, and the noise it used."""
     posterior = make_amortized_svgd(TINY, tiny_apply, 1, optimizer or optax.sgd(1.0), config, **kwargs)
     state = posterior.init(jax.random.key(0))
-    new, metrics = posterior.update(jax.random.key(1), state, jnp.asarray(x)[:, None], jnp.asarray(y)[:, None], num_data)
+    new, metrics = posterior.update(
+        jax.random.key(1), state, jnp.asarray(x)[:, None], jnp.asarray(y)[:, None], num_data
+    )
     flat = [np.concatenate([np.ravel(s.eta["w"]), s.eta["b"]]) for s in (state, new)]
     return flat[0], flat[1], np.asarray(new.z), metrics
 
@@ -405,9 +407,11 @@ def test_guards():
             make_amortized_svgd(TINY, tiny_apply, 1, optax.sgd(1.0), SVGDConfig(repulsion_points=points))
     with pytest.warns(UserWarning, match="variance grows without bound"):
         make_amortized_svgd(TINY, tiny_apply, 1, optax.sgd(1.0), repulsion_inputs=lambda key, inputs: inputs)
-    # Warnings are errors here: these have a prior, or no points beyond the data.
+    # Warnings are errors here: these have a prior, or no points beyond the data, or were told to be let through.
     make_amortized_svgd(TINY, tiny_apply, 1, optax.sgd(1.0), SVGDConfig(repulsion_points="uniform", prior="gp"))
     make_amortized_svgd(TINY, tiny_apply, 1, optax.sgd(1.0), SVGDConfig(repulsion_points="independent"))
+    accepted = SVGDConfig(repulsion_points="uniform", accept_improper=True)
+    make_amortized_svgd(TINY, tiny_apply, 1, optax.sgd(1.0), accepted)
 
 
 @pytest.mark.parametrize("rule", ["median", "median_log", "mean"])
