@@ -9,16 +9,15 @@ import numpy as np
 import jaxplore
 
 ROOT = Path(__file__).parent.parent
+FOLDERS = ("jaxplore", "envs", "experiments")
 README = (ROOT / "README.md").read_text()
 
 
 def test_the_python_example_runs_and_its_networks_fit_the_data():
     (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
     names: dict = {}
-    exec(code, names)  # noqa: S102
-    predictions = np.stack(
-        [names["net"].apply({"params": jaxplore_take(names["networks"], i)}, names["x"]) for i in range(100)]
-    )
+    exec(code, names)
+    predictions = np.stack([names["net"].apply({"params": take(names["networks"], i)}, names["x"]) for i in range(100)])
     truth = np.sin(3 * np.asarray(names["x"]))
     # The data's own spread is 0.69; a network that fits is far within it.
     assert np.sqrt(np.mean((predictions.mean(axis=0) - truth) ** 2)) < 0.1
@@ -26,19 +25,19 @@ def test_the_python_example_runs_and_its_networks_fit_the_data():
     assert 0.005 < predictions.std(axis=0).mean() < 0.3
 
 
-def jaxplore_take(tree, i):
+def take(tree, i):
     """The i-th network of a batch."""
     return {layer: {name: jnp.asarray(leaf)[i] for name, leaf in leaves.items()} for layer, leaves in tree.items()}
 
 
 def test_the_map_names_every_module():
     (tree,) = re.findall(r"## Where things are\n\n```\n(.*?)```", README, re.DOTALL)
-    for folder in ("jaxplore", "envs", "experiments"):
+    for folder in FOLDERS:
         for module in (ROOT / folder).glob("*.py"):
             if module.name != "__init__.py":
                 assert module.name in tree, f"{folder}/{module.name} is not on the map"
     for name in re.findall(r"\w+\.py", tree):
-        assert any((ROOT / folder / name).exists() for folder in ("jaxplore", "envs", "experiments", "benchmarks")), name
+        assert any((ROOT / folder / name).exists() for folder in FOLDERS), name
 
 
 def test_public_names_exist():

@@ -1,0 +1,74 @@
+"""Runs side by side: medians, ranges and the steps at which cells were reached, from files written by hand."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from experiments import compare
+from experiments.config import preset_config, to_json
+
+
+def write_run(path: Path, method: str, seed: int, reached: list[int], steps: int = 1_000) -> Path:
+    """A finished run that sees its cells at the given steps."""
+    path.mkdir()
+    config = dataclasses.replace(preset_config("laptop"), method=method, seed=seed, steps=steps)
+    (path / "config.json").write_text(to_json(config))
+    rows = []
+    for step in range(25, steps + 1, 25):
+        cells = sum(at <= step for at in reached)
+        rows.append({"step": step, "seed": seed, "coverage": cells / 7, "cells": cells, "wall_time": step * 0.06})
+    (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return path
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> list[Path]:
+    """Three seeds of one method, the middle one seeing all there is, and one of another."""
+    return [
+        write_run(tmp_path / "a", "implicit", 0, [25, 50, 300, 400, 925]),
+        write_run(tmp_path / "b", "implicit", 1, [25, 50, 75, 100, 125, 150, 700]),
+        write_run(tmp_path / "c", "implicit", 2, [25, 50, 300, 400, 925, 950]),
+        write_run(tmp_path / "d", "random", 0, [25, 50, 625]),
+    ]
+
+
+def test_table_and_files(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture):
+    assert compare.main([*map(str, runs), f"--out={tmp_path / 'out'}"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert "| `implicit` | 3 | 6 (5 to 7) | 5, 7, 6 | 700 | 1.0 |" in lines
+    assert "| `random` | 1 | 3 (3 to 3) | 3 | - | 1.0 |" in lines
+    record = json.loads((tmp_path / "out" / "comparison.json").read_text())
+    assert record["methods"]["implicit"][1]["reached"] == [25, 50, 75, 100, 125, 150, 700]
+    assert record["methods"]["random"][0] == {"seed": 0, "cells": 3, "reached": [25, 50, 625], "minutes": 1.0}
+    assert (tmp_path / "out" / "coverage.png").stat().st_size > 10_000
+
+
+def test_curves_hold_the_last_value_known(runs: list[Path]):
+    _, (implicit, random) = compare.group(runs)
+    assert list(implicit.steps[:3]) == [100, 200, 300]
+    assert list(implicit.coverage[0] * 7) == pytest.approx([2, 2, 3, 4, 4, 4, 4, 4, 4, 5])
+    assert list(random.coverage[0] * 7) == pytest.approx([2, 2, 2, 2, 2, 2, 3, 3, 3, 3])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda path: write_run(path, "implicit", 0, [25]), "seed 0 comes twice"),
+        (lambda path: write_run(path, "implicit", 7, [25], steps=500), "over 500 steps"),
+        (lambda path: path, "holds no run"),
+    ],
+)
+def test_refuses(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture, change, message: str):
+    other = change(tmp_path / "other")
+    assert compare.main([*map(str, runs), str(other), f"--out={tmp_path / 'out'}"]) == 1
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_refuses_a_run_that_has_not_finished(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture):
+    metrics = runs[0] / "metrics.jsonl"
+    metrics.write_text("".join(metrics.read_text().splitlines(keepends=True)[:10]))
+    assert compare.main([str(runs[0]), f"--out={tmp_path / 'out'}"]) == 1
+    assert "stands at step 250 of 1000. Finish it with --resume" in capsys.readouterr().err
