@@ -87,7 +87,7 @@ def make_environment(task: Task, obs_noise: float = 0.0) -> Environment:
         if obs_noise == 0:
             return key, obs
         key, noise = draw(key)
-        return key, obs + np.asarray(noise)
+        return key, obs + jax.device_get(noise)
 
     def observe(before: Any, after: Any) -> np.ndarray:
         with np.errstate(over="ignore", invalid="ignore"):  # A diverged state is for `terminated` to tell.
@@ -96,12 +96,13 @@ def make_environment(task: Task, obs_noise: float = 0.0) -> Environment:
 
     def reset(key: Key) -> EnvState:
         qpos, qvel, key = start(key)
-        state = physics.init(np.asarray(qpos), np.asarray(qvel))
+        state = physics.init(*jax.device_get((qpos, qvel)))
         key, obs = noisy(key, observe(state, state))
         return EnvState(state, obs, np.int32(0), key)
 
     def step(state: EnvState, action: Any) -> tuple[EnvState, Transition]:
-        action = np.asarray(action, np.float32)
+        # Not asarray: on an array still being computed NumPy waits with Python's lock held, and can hang.
+        action = np.asarray(jax.device_get(action), np.float32)
         if action.shape != action_shape:
             raise ValueError(f"action has shape {action.shape}. Allowed: {action_shape}.")
         if not np.isfinite(action).all():

@@ -211,10 +211,14 @@ def _encode(state: Any) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]
     records: dict[str, dict[str, Any]] = {}
     for name, leaf in _named_leaves(state)[0].items():
         if isinstance(leaf, jax.Array) and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            kind, extra, array = "key", {"impl": str(jax.random.key_impl(leaf))}, np.asarray(jax.random.key_data(leaf))
+            kind, extra, array = (
+                "key",
+                {"impl": str(jax.random.key_impl(leaf))},
+                np.asarray(jax.device_get(jax.random.key_data(leaf))),
+            )
         elif isinstance(leaf, jax.Array):
             # Weak types are kept: a resumed state must hit the compiled programs of the first one.
-            kind, extra, array = "jax", {"weak": bool(leaf.weak_type)}, np.asarray(leaf)
+            kind, extra, array = "jax", {"weak": bool(leaf.weak_type)}, np.asarray(jax.device_get(leaf))
         elif isinstance(leaf, np.ndarray | np.generic):
             kind, extra, array = "numpy", {"scalar": isinstance(leaf, np.generic)}, np.asarray(leaf, order="C")
         elif isinstance(leaf, bool | int | float | str):

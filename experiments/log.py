@@ -260,8 +260,9 @@ class Progress:
     ) -> None:
         self._stream = stream or sys.stderr
         self._total, self._step, self._num_cells = total_steps, start_step, num_cells
-        # Speed is that of the last rounds: the first ones are slower by the time it takes to compile.
-        self._recent = deque([(time.monotonic(), start_step)], maxlen=20)
+        # Speed is that of the last rounds, since learning began: before that they are quicker, and then comes the
+        # time it takes to compile.
+        self._recent, self._learning = deque([(time.monotonic(), start_step)], maxlen=20), False
         self._bar = None
         if self._stream.isatty() if live is None else live:
             try:
@@ -274,10 +275,15 @@ class Progress:
 
     def update(self, step: int, rows: Sequence[Row]) -> None:
         """Shows a round: `step` environment steps are done, `rows` are the round's (one per seed)."""
+        if not self._learning and _values(rows, "intrinsic_reward"):
+            self._recent.clear()
+            self._learning = True
         self._recent.append((time.monotonic(), step))
         seconds, steps = (new - old for new, old in zip(self._recent[-1], self._recent[0], strict=True))
         rate = steps / seconds if seconds > 0 else 0.0
-        text = f"{_seen(rows, self._num_cells)}{rate:.{0 if rate >= 9.95 else 1}f} steps/s"
+        text = _seen(rows, self._num_cells)
+        if rate > 0:
+            text += f"{rate:.{0 if rate >= 9.95 else 1}f} steps/s"
         if rate > 0 and step < self._total:
             left = (self._total - step) / rate
             text += f"  {duration(left) if left < 60 or left >= 3600 else f'{left / 60:.0f} min'} left"
@@ -290,7 +296,7 @@ class Progress:
             self._bar.update(done)
         elif tenth:
             count = f"{step:,}".rjust(len(f"{self._total:,}"))
-            self.say(f"{100 * step / self._total:3.0f}% | {count}/{self._total:,}  {text}")
+            self.say(f"{100 * step / self._total:3.0f}% | {count}/{self._total:,}  {text}".rstrip())
 
     def say(self, text: str) -> None:
         """Prints a line, above the bar if there is one."""

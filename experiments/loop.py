@@ -276,7 +276,7 @@ def _carry_on(
     # Positions are written in place; a restored array may be read-only.
     state = dataclasses.replace(
         state,
-        visited=np.array(state.visited),
+        visited=np.array(jax.device_get(state.visited)),
         positions=np.array(state.positions),
         episode_steps=np.array(state.episode_steps),
     )
@@ -320,7 +320,7 @@ def _carry_on(
 
 def _episode_step(env: Environment, env_state: Any) -> np.ndarray:
     """The step of its episode that each seed's next step is, `[S]`."""
-    return np.asarray(env_state.num_steps if env.compiled else [state.num_steps for state in env_state])
+    return jax.device_get(env_state.num_steps) if env.compiled else np.array([state.num_steps for state in env_state])
 
 
 def _remember(
@@ -336,7 +336,8 @@ def _remember(
     """Note in `state`, in place, which cells the round saw and where it went."""
     count = end - first
     obs = transitions.obs[:, :count]
-    state.visited[:] = programs.mark(state.visited, transitions.obs, valid)
+    # device_get, here and elsewhere: NumPy itself would wait for the result with Python's lock held, and hang.
+    state.visited[:] = jax.device_get(programs.mark(state.visited, transitions.obs, valid))
     if env.floor_plan is None:
         return
     state.positions[:, first:end] = obs[..., list(env.floor_plan.position)]

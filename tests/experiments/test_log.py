@@ -265,6 +265,19 @@ def test_progress_on_a_terminal_is_one_bar():
     assert text.count("\n") == 2
 
 
+def test_speed_and_time_left_begin_anew_with_learning(monkeypatch: pytest.MonkeyPatch):
+    clock = iter([0.0, 1.0, 61.0, 71.0])
+    monkeypatch.setattr("time.monotonic", lambda: next(clock))
+    stream = io.StringIO()
+    progress = Progress(1000, stream=stream)
+    for step, reward in ((100, None), (200, 0.5), (300, 0.5)):
+        progress.update(step, [{"step": step, "seed": 0, "intrinsic_reward": reward}])
+    warm_up, compiled, learned = stream.getvalue().splitlines()
+    assert warm_up.endswith("100 steps/s  9 s left")
+    assert "steps/s" not in compiled
+    assert learned.endswith("10 steps/s  1 min left")
+
+
 def test_durations():
     assert [duration(s) for s in (0, 59.4, 60, 832, 3599.6, 7500)] == [
         "0 s",
