@@ -15,6 +15,8 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "0")
 import jax
 import pytest
 
+import experiments  # noqa: F401  (sets switches of JAX's for the tests of the library, too)
+
 # Not through the environment: a command under test should see the devices that a user's command sees.
 jax.config.update("jax_num_cpu_devices", 2)
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -23,7 +23,11 @@ from jaxplore import beliefs, methods
 from jaxplore.methods import Method
 from tests.experiments.tiny import CELLS, ROOT, STEPS, TINY, assert_same_run, leaves, rows
 
-RANDOM = ("--env=point", "--method=random", "--preset=smoke", "--steps=60", "--warm-up-steps=30")
+# Rounds that end at 25, 30, 50 and 60; checkpoints at 25, 50 and 60.
+RANDOM = (
+    *("--env=point", "--method=random", "--preset=smoke"),
+    *("--steps=60", "--warm-up-steps=30", "--checkpoint-every=20"),
+)
 
 
 def parse(*words: str):
@@ -402,46 +406,42 @@ def full_disk(*_: Any, **__: Any):
     raise OSError(errno.ENOSPC, "No space left on device")
 
 
-@pytest.mark.parametrize("what", ["metrics", "checkpoint", "walk", "picture"])
+@pytest.mark.parametrize(("what", "last"), [("metrics", 50), ("checkpoint", 50), ("walk", 60), ("picture", 60)])
 def test_a_full_disk_ends_the_run_and_spares_the_last_checkpoint(
-    what: str, finished, tell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    what: str, last: int, small, tell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    """Of the ant, for all that a real checkpoint holds."""
-    out = tmp_path / "run"
+    out = tmp_path / "full"
+    append, save = log.MetricsLog.append, Checkpoints.save
     with monkeypatch.context() as patch:
+
+        def append_until_full(self, told):
+            if told[0]["step"] == 60:
+                patch.setattr(os, "write", full_disk)
+            append(self, told)
+
+        def save_until_full(self, step, *rest):
+            if step == 60:
+                patch.setattr(os, "fsync", full_disk)
+            save(self, step, *rest)
+
         if what == "metrics":
-            original = log.MetricsLog.append
-
-            def append(self, told):
-                if told[0]["step"] == 75:
-                    patch.setattr(os, "write", full_disk)
-                original(self, told)
-
-            patch.setattr(log.MetricsLog, "append", append)
+            patch.setattr(log.MetricsLog, "append", append_until_full)
         elif what == "checkpoint":
-            save = Checkpoints.save
-
-            def save_until_full(self, step, *rest):
-                if step == 75:
-                    patch.setattr(os, "fsync", full_disk)
-                save(self, step, *rest)
-
             patch.setattr(Checkpoints, "save", save_until_full)
         elif what == "walk":
             patch.setattr(np, "savez_compressed", full_disk)
         else:
             patch.setattr("matplotlib.figure.Figure.savefig", full_disk)
-        told = tell(out, *TINY)
+        told = tell(out, *RANDOM)
     assert told.status == 1
     (line,) = [line for line in told.stderr.splitlines() if line.startswith("error: ")]
     assert re.search(rf"cannot .* in {re.escape(str(out))}.*: No space left on device\. What to do: free some", line)
     assert "Traceback" not in told.stderr
-    last = Checkpoints(out / "checkpoints").steps()[-1]
-    assert last == {"metrics": 50, "checkpoint": 50, "walk": 81, "picture": 81}[what]
+    assert Checkpoints(out / "checkpoints").steps()[-1] == last
     leaves(out, last)
-    assert not (out / "walk.npz").exists() or what == "picture"
+    assert (out / "walk.npz").exists() == (what == "picture")
     assert tell(out, "--resume").status == 0
-    assert_same_run(finished.out, out)
+    assert_same_run(small.out, out, 60)
     assert not list(out.rglob("*.tmp*"))
 
 

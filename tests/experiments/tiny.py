@@ -66,10 +66,10 @@ def leaves(out: Path, step: int = STEPS[-1]) -> dict[str, Any]:
     return records
 
 
-def assert_same_run(out: Path, other: Path) -> None:
+def assert_same_run(out: Path, other: Path, step: int = STEPS[-1]) -> None:
     """Two runs have the same metrics, times aside, and the same last state, to the bit."""
     assert rows(out) == rows(other)
-    state, twin = leaves(out), leaves(other)
+    state, twin = leaves(out, step), leaves(other, step)
     assert state.keys() == twin.keys()
     assert [name for name in state if state[name] != twin[name]] == []
     with np.load(out / "walk.npz") as walk, np.load(other / "walk.npz") as expected:
