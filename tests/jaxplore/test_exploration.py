@@ -54,14 +54,14 @@ def tagged(config):
 
 
 def recording_learner(sizes, batch_size):
-    """It keeps its last batch, counts its updates, acts with 5 and greedily with the obs it sees."""
+    """It keeps its last batch, counts its updates, acts with 5 + tanh of the obs it sees and greedily with that obs."""
     rows = lambda *shape: jnp.zeros((batch_size, *shape))  # noqa: E731
     flag = jnp.zeros(batch_size, bool)
     empty = Transition(rows(sizes.obs), rows(sizes.action), rows(), rows(sizes.obs), flag, flag)
     return Learner(
         init=lambda key: {"updates": jnp.zeros((), jnp.int32), "batch": empty},
         actor=lambda state: state["updates"],
-        act=lambda key, actor, obs: jnp.full((*obs.shape[:-1], sizes.action), 5.0),
+        act=lambda key, actor, obs: 5.0 + jnp.tanh(obs[..., : sizes.action]),
         act_greedily=lambda actor, obs: obs[..., : sizes.action],
         update=lambda key, state, batch: ({"updates": state["updates"] + 1, "batch": batch}, {"one": jnp.ones(())}),
         batch_size=batch_size,
@@ -196,14 +196,16 @@ def test_restart_resets_the_policy_and_its_imagined_data(restart_every, lives):
 
 
 def test_first_rollouts_take_uniform_actions():
-    # two random rollouts of 64 actors (768 numbers: mean 0 +- 0.02, variance 1/3 +- 0.011), then the policy's 5
+    # two random rollouts of 64 actors (768 numbers: mean 0 +- 0.02, variance 1/3 +- 0.011), then the policy's,
+    # which sees normalised observations
     explorer = fake_explorer(num_actors=64, horizon=3, num_rollouts=3, num_random_rollouts=2, replay_capacity=1000)
     state, _ = explorer.improve(jax.random.key(0), begin(explorer), OBS, 20)
-    actions = held(state.behaviour.imagined).action
+    rows = held(state.behaviour.imagined)
+    actions = rows.action
     assert np.mean(actions[:384]) == pytest.approx(0, abs=0.08)
     assert np.var(actions[:384]) == pytest.approx(1 / 3, abs=0.04)
     assert np.max(np.abs(actions[:384])) <= 1
-    np.testing.assert_array_equal(actions[384:], 5.0)
+    np.testing.assert_allclose(actions[384:], 5 + np.tanh(normal(state, rows)[0][384:, : SIZES.action]), rtol=1e-4)
 
 
 def test_real_data_get_the_reward_computed_directly():
@@ -232,12 +234,12 @@ def test_real_data_get_the_reward_computed_directly():
 
 @pytest.mark.parametrize(("fraction", "want"), [(0.0, 0), (0.25, 4), (1.0, 16)])
 def test_share_of_real_rows_in_a_batch(fraction, want):
-    # imagined transitions never terminate; here all real ones do, and their actions are not 5
+    # imagined transitions never terminate; here all real ones do, and their actions are below 4
     explorer = fake_explorer(real_fraction=fraction)
     state, _ = explorer.improve(jax.random.key(0), begin(explorer, terminated=True), OBS, 20)
     batch = state.behaviour.learner["batch"]
     assert int(jnp.sum(batch.terminated)) == want
-    assert int(jnp.sum(jnp.all(batch.action == 5.0, axis=1))) == 16 - want
+    assert int(jnp.sum(jnp.all(batch.action > 3.9, axis=1))) == 16 - want
 
 
 def test_rewards_are_divided_by_their_standard_deviation():
@@ -293,13 +295,13 @@ def test_imagined_rows_that_are_not_finite_are_dropped():
 
 @pytest.mark.parametrize("greedily", [True, False])
 def test_acting_sees_normalised_observations(greedily):
-    # the fake's greedy action is what it sees; its drawn one is 5; any leading axes
+    # the fake's greedy action is what it sees, its drawn one 5 + tanh of it; any leading axes
     explorer = fake_explorer(act_greedily=greedily)
     state = begin(explorer)
     obs = transitions(6, seed=1).obs.reshape(2, 3, SIZES.obs)
     stats = state.normalizers.obs
     seen = (np.asarray(obs) - np.asarray(stats.mean)) / np.asarray(stats.std)
-    want = seen[..., : SIZES.action] if greedily else np.full((2, 3, 2), 5.0)
+    want = seen[..., : SIZES.action] if greedily else 5 + np.tanh(seen[..., : SIZES.action])
     np.testing.assert_allclose(explorer.act(jax.random.key(0), explorer.actor(state), obs), want, rtol=1e-4, atol=1e-5)
 
 
