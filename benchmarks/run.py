@@ -19,7 +19,7 @@ import numpy as np
 
 import envs
 from benchmarks import flops
-from benchmarks.timing import Timing, matmul_rate, measure, stream_rate
+from benchmarks.timing import Timing, matmul_rate, measure
 from envs.base import Environment
 from experiments import loop
 from experiments.config import RunConfig, preset_config
@@ -280,8 +280,8 @@ def main() -> int:
     arguments = parser.parse_args()
     use_compilation_cache()
     device = jax.devices()[0].device_kind
-    rate, bandwidth = matmul_rate(), stream_rate()
-    print(f"{device}: {rate / 1e9:,.0f} GFLOP/s in a float32 matrix product, {bandwidth / 1e9:,.0f} GB/s in x + 1\n")
+    rate = matmul_rate()
+    print(f"{device}: {rate / 1e9:,.0f} GFLOP/s in a float32 matrix product\n")
     results = []
     for result in run_all(rate, quick=arguments.quick):
         results.append(result)
@@ -295,7 +295,6 @@ def main() -> int:
         "platform": platform.platform(),
         "date": time.strftime("%Y-%m-%d"),
         "matmul_flops_per_second": rate,
-        "stream_bytes_per_second": bandwidth,
         "versions": versions(),
     }
     rows = [{**dataclasses.asdict(result), "times_floor": result.times_floor} for result in results]

@@ -1,4 +1,4 @@
-"""The one timing helper of the benchmarks, and the machine's own limits measured with it."""
+"""The one timing helper of the benchmarks, and the machine's own limit measured with it."""
 
 import time
 from collections.abc import Callable
@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 
 MATMUL_SIZE = 2048
-STREAM_BYTES = 1 << 28
 
 
 class Timing(NamedTuple):
@@ -45,10 +44,3 @@ def matmul_rate() -> float:
     matrix = jax.random.normal(jax.random.key(0), (MATMUL_SIZE, MATMUL_SIZE))
     product = jax.jit(jnp.matmul)
     return 2.0 * MATMUL_SIZE**3 / measure(lambda: product(matrix, matrix), repeats=10).best
-
-
-def stream_rate() -> float:
-    """Bytes/s that the default device reads and writes in `x + 1` on an array too large for its caches."""
-    array = jnp.zeros(STREAM_BYTES // 4)
-    add = jax.jit(lambda x: x + 1.0)
-    return 2.0 * STREAM_BYTES / measure(lambda: add(array), repeats=5).best

@@ -5,7 +5,8 @@ from collections.abc import Callable
 from typing import Any
 
 from envs.ant_maze import make_ant_maze
-from envs.base import Coverage, Environment, EnvSpec, EnvState, FloorPlan, check_choice
+from envs.base import Coverage, Environment, EnvSpec, EnvState, FloorPlan
+from jaxplore import validate
 
 FACTORIES: dict[str, Callable[..., Environment]] = {
     "ant_maze": make_ant_maze,
@@ -24,10 +25,10 @@ def make(name: str, **options: Any) -> Environment:
         ValueError: an unknown name or option, with the nearest match and the list of those that are known; or an
             option's value that the factory refuses.
     """
-    check_choice("name of the environment", name, FACTORIES)
+    validate.one_of("env", name, FACTORIES)
     factory = FACTORIES[name]
     for option in options:
-        check_choice(f"option of {name!r}", option, inspect.signature(factory).parameters)
+        validate.one_of(f"option of {name!r}", option, inspect.signature(factory).parameters)
     return factory(**options)
 
 

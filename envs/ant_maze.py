@@ -189,8 +189,9 @@ def make_ant_maze(backend: str = "auto", obs_noise: float = 0.0) -> Environment:
         frame_skip=FRAME_SKIP,
         start=start,
         observe=observe,
-        reward=lambda xp, action, obs: 0.0,
+        reward=lambda xp, action, qpos_before, qpos, qvel: 0.0,
         coverage=make_box_coverage(POSITION, CELLS, "maze cells"),
+        cameras=("track", "overview"),
         floor_plan=FloorPlan(POSITION, WALLS, CELLS),
     )
     return choose_engine(backend).make_environment(task, obs_noise)

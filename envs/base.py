@@ -9,18 +9,19 @@ No environment resets itself. `Transition.next_obs` is always the true successor
 `terminated` or `truncated` is set (`envs.wrappers` has that loop for both kinds).
 """
 
-import difflib
 import importlib
 import math
 import numbers
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 from flax import struct
 
+from jaxplore import validate
 from jaxplore.types import Array, Key, Transition
 
 
@@ -29,7 +30,7 @@ class EnvState:
     """Everything an environment needs to go on."""
 
     physics: Any
-    """The engine's own state: `mjx_backend.MjxState`, or C MuJoCo's integration state vector; see `Physics`."""
+    """The engine's own state: `mjx_backend.MjxState`, C MuJoCo's integration state vector, or what `Rules` hold."""
     obs: Array
     """The observation that the agent sees now, `[O]`, float32, with observation noise if there is any."""
     num_steps: Array
@@ -46,11 +47,15 @@ class EnvSpec:
     obs_names: tuple[str, ...]
     """Name and unit of each observation entry, such as `"x [m]"`."""
     action_names: tuple[str, ...]
-    """Name of each action entry; all actions are in [-1, 1]."""
+    """Name of each action entry, or of each choice where actions are discrete."""
     episode_steps: int
     """Steps after which an episode is truncated."""
     dt: float
     """Seconds between two steps."""
+    discrete: bool = False
+    """False: action entries are numbers in [-1, 1]. True: an action is one of `A` choices, as a one-hot `[A]`."""
+    one_hot_obs: bool = False
+    """Whether an observation is one of `O` states, as a one-hot vector `[O]`."""
 
     @property
     def obs_size(self) -> int:
@@ -71,6 +76,8 @@ class Coverage(NamedTuple):
     """`cell(obs [O]) -> int32`: the cell that an observation lies in, 0 to num_cells - 1, or -1 outside of all."""
     unit: str
     """What a cell is, for axis labels, such as `"maze cells"`."""
+    reachable: int | None = None
+    """How many of the cells can be reached, where that is known and not all: shown wherever coverage is."""
 
 
 class FloorPlan(NamedTuple):
@@ -85,12 +92,14 @@ class FloorPlan(NamedTuple):
 
 
 class View(NamedTuple):
-    """What drawing an environment takes."""
+    """How an environment is drawn; `envs.views` makes them."""
 
-    model: Any
-    """A `mujoco.MjModel`, with cameras "track" and "overview"."""
-    qpos: Callable[[EnvState], Array]
-    """`qpos(state) -> [nq]`: the model's positions in a state."""
+    frames: Callable[[Sequence[EnvState], int, int, str], Iterator[np.ndarray]]
+    """`frames(states, height, width, camera)`: one uint8 `[height, width, 3]` per state."""
+    cameras: tuple[str, ...]
+    """Where it can be looked at from; the first is the usual place."""
+    needs_renderer: bool
+    """Whether drawing takes an OpenGL library."""
 
 
 @dataclass(frozen=True)
@@ -137,10 +146,14 @@ class Task(NamedTuple):
     observe: Callable[[ModuleType, Array, Array, Array], Array]
     """`observe(xp, qpos_before [nq], qpos [nq], qvel [nv]) -> [O]`; `xp` is `numpy` or `jax.numpy`. The positions are
     those before and after the step, equal at a reset."""
-    reward: Callable[[ModuleType, Array, Array], Array | float]
-    """`reward(xp, action [A], obs [O])` with the observation after the step, free of noise."""
+    reward: Callable[[ModuleType, Array, Array, Array, Array], Array | float]
+    """`reward(xp, action [A], qpos_before [nq], qpos [nq], qvel [nv])`, of the step that led there."""
     coverage: Coverage
+    cameras: tuple[str, ...]
+    """Names of the model's cameras, the usual one first."""
     floor_plan: FloorPlan | None = None
+    control: Callable[[ModuleType, Array], Array] = lambda xp, action: action
+    """`control(xp, action [A]) -> ctrl [nu]`, of an action in [-1, 1]."""
 
 
 ENGINES = {"mjx": "envs.mjx_backend", "mujoco": "envs.host_backend"}
@@ -151,19 +164,10 @@ def choose_engine(backend: str) -> ModuleType:
 
     Raises `ValueError` for any other name.
     """
-    check_choice("backend", backend, ("auto", *ENGINES))
+    validate.one_of("backend", backend, ("auto", *ENGINES))
     if backend == "auto":
         backend = "mujoco" if jax.default_backend() == "cpu" else "mjx"
     return importlib.import_module(ENGINES[backend])
-
-
-def check_choice(field: str, value: str, allowed: Iterable[str]) -> None:
-    """Raises `ValueError` with the nearest match and the list of what is allowed, unless `value` is in `allowed`."""
-    allowed = sorted(allowed)
-    if value not in allowed:
-        nearest = difflib.get_close_matches(str(value), allowed, n=1)
-        hint = f" Did you mean {nearest[0]!r}?" if nearest else ""
-        raise ValueError(f"{field} is {value!r}.{hint} Allowed: {', '.join(allowed) or 'none'}.")
 
 
 def check_noise(obs_noise: float) -> float:

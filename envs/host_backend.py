@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from envs.base import Environment, EnvState, Physics, Task, View, check_noise
+from envs.base import Environment, EnvState, Physics, Task, check_noise
+from envs.views import make_mujoco_view
 from jaxplore.types import Array, Key, Transition
 
 BACKEND = "mujoco"
@@ -94,6 +95,10 @@ def make_environment(task: Task, obs_noise: float = 0.0) -> Environment:
             obs = task.observe(np, physics.qpos(before), physics.qpos(after), physics.qvel(after))
             return obs.astype(np.float32)
 
+    def reward(action: np.ndarray, before: Any, after: Any) -> Any:
+        with np.errstate(over="ignore", invalid="ignore"):
+            return task.reward(np, action, physics.qpos(before), physics.qpos(after), physics.qvel(after))
+
     def reset(key: Key) -> EnvState:
         qpos, qvel, key = start(key)
         state = physics.init(*jax.device_get((qpos, qvel)))
@@ -108,19 +113,19 @@ def make_environment(task: Task, obs_noise: float = 0.0) -> Environment:
         if not np.isfinite(action).all():
             raise ValueError(f"action is {action}. Allowed: finite numbers.")
         action = np.clip(action, -1.0, 1.0)
-        after = physics.step(state.physics, action)
+        after = physics.step(state.physics, task.control(np, action))
         clean = observe(state.physics, after)
         key, obs = noisy(state.key, clean)
         num_steps = np.int32(state.num_steps + 1)
         transition = Transition(
             obs=state.obs,
             action=action,
-            reward=np.float32(task.reward(np, action, clean)),
+            reward=np.float32(reward(action, state.physics, after)),
             next_obs=obs,
             terminated=np.bool_(not np.isfinite(after).all()),
             truncated=np.bool_(num_steps >= spec.episode_steps),
         )
         return EnvState(after, obs, num_steps, key), transition
 
-    view = View(task.model, lambda state: physics.qpos(state.physics))
+    view = make_mujoco_view(task.model, lambda state: physics.qpos(state.physics), task.cameras)
     return Environment(spec, reset, step, task.coverage, BACKEND, False, task.floor_plan, view)

@@ -19,8 +19,10 @@ import mujoco
 import numpy as np
 from flax import struct
 
-from envs.base import Environment, EnvState, Physics, Task, View, check_noise
-from jaxplore.types import Array, Key, Transition
+from envs import functional
+from envs.base import Environment, Physics, Task
+from envs.views import make_mujoco_view
+from jaxplore.types import Array
 
 with contextlib.redirect_stdout(io.StringIO()):  # It prints that the optional Warp engine is absent.
     from mujoco import mjx
@@ -68,10 +70,7 @@ def make_physics(model: mujoco.MjModel, frame_skip: int) -> Physics:
 
 
 def make_environment(task: Task, obs_noise: float = 0.0) -> Environment:
-    """`task` on MJX. See `envs.base` for the contract.
-
-    `step` clips actions to [-1, 1]. A state that is no longer finite, as after an action that is not, ends the episode
-    as `terminated`; `next_obs` is then what was computed.
+    """`task` on MJX. See `envs.base` for the contract and `envs.functional` for what holds beside it.
 
     Args:
         task: what to run.
@@ -81,47 +80,19 @@ def make_environment(task: Task, obs_noise: float = 0.0) -> Environment:
     Raises:
         ValueError: `obs_noise` is negative or not finite; from `step`, when traced: the action is not of shape `[A]`.
     """
-    obs_noise = check_noise(obs_noise)
-    spec, physics = task.spec, make_physics(task.model, task.frame_skip)
-    action_shape = (spec.action_size,)
+    physics = make_physics(task.model, task.frame_skip)
 
-    def observe(before: MjxState, after: MjxState) -> Array:
-        obs = task.observe(jnp, physics.qpos(before), physics.qpos(after), physics.qvel(after))
-        return obs.astype(jnp.float32)
+    def known(state: MjxState) -> tuple[Array, Array]:
+        return physics.qpos(state), physics.qvel(state)
 
-    def noisy(key: Key, obs: Array) -> tuple[Key, Array]:
-        if obs_noise == 0:
-            return key, obs
-        key, noise_key = jax.random.split(key)
-        return key, obs + obs_noise * jax.random.normal(noise_key, obs.shape, obs.dtype)
-
-    def reset(key: Key) -> EnvState:
-        start_key, key = jax.random.split(key)
-        state = physics.init(*task.start(start_key))
-        key, obs = noisy(key, observe(state, state))
-        return EnvState(state, obs, jnp.int32(0), key)
-
-    def step(state: EnvState, action: Array) -> tuple[EnvState, Transition]:
-        if jnp.shape(action) != action_shape:
-            raise ValueError(f"action has shape {jnp.shape(action)}. Allowed: {action_shape}.")
-        action = jnp.clip(jnp.asarray(action, jnp.float32), -1.0, 1.0)
-        after = physics.step(state.physics, action)
-        clean = observe(state.physics, after)
-        key, obs = noisy(state.key, clean)
-        num_steps = state.num_steps + 1
-        transition = Transition(
-            obs=state.obs,
-            action=action,
-            reward=jnp.asarray(task.reward(jnp, action, clean), jnp.float32),
-            next_obs=obs,
-            terminated=~_finite(after),
-            truncated=num_steps >= spec.episode_steps,
-        )
-        return EnvState(after, obs, num_steps, key), transition
-
-    view = View(task.model, lambda state: physics.qpos(state.physics))
-    return Environment(spec, reset, step, task.coverage, BACKEND, True, task.floor_plan, view)
-
-
-def _finite(state: MjxState) -> Array:
-    return jnp.isfinite(jnp.concatenate([state.qpos, state.qvel, state.act, state.qacc_warmstart])).all()
+    rules = functional.Rules(
+        spec=task.spec,
+        start=lambda key: physics.init(*task.start(key)),
+        advance=lambda key, state, action: physics.step(state, task.control(jnp, action)),
+        observe=lambda before, after: task.observe(jnp, physics.qpos(before), *known(after)),
+        reward=lambda before, action, after: task.reward(jnp, action, physics.qpos(before), *known(after)),
+        coverage=task.coverage,
+        floor_plan=task.floor_plan,
+        view=make_mujoco_view(task.model, lambda state: physics.qpos(state.physics), task.cameras),
+    )
+    return functional.make_environment(rules, obs_noise, BACKEND)

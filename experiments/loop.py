@@ -73,7 +73,9 @@ def make_environment(config: RunConfig) -> Environment:
 
 def make_run_explorer(config: RunConfig, env: Environment) -> Explorer:
     """The explorer that a configuration names, for its environment."""
-    return make_explorer(get_method(config.method), Sizes(env.spec.obs_size, env.spec.action_size), config.explorer)
+    spec = env.spec
+    sizes = Sizes(spec.obs_size, spec.action_size, spec.discrete, spec.one_hot_obs)
+    return make_explorer(get_method(config.method), sizes, config.explorer)
 
 
 def make_programs(config: RunConfig, env: Environment, explorer: Explorer) -> Programs:

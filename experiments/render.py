@@ -1,4 +1,4 @@
-"""`python -m experiments.render RUN`: a video of a run's agent acting in its environment."""
+"""`python -m experiments.render RUN`: a video or a picture of a run's agent acting in its environment."""
 
 # MuJoCo loads its GL library when it is imported, and fails to be imported where that one does not work. So what
 # imports MuJoCo is imported late, once a renderer has been found.
@@ -12,7 +12,7 @@ import os
 import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,12 +21,16 @@ import numpy as np
 from experiments.errors import RunError, disk_error
 
 if TYPE_CHECKING:
-    from envs.base import Environment
+    from envs.base import Environment, EnvState
+    from envs.wrappers import Act
     from experiments.config import RunConfig
-    from jaxplore.types import Array, Key
 
 RENDERERS = ("egl", "osmesa", "cgl", "glfw")
 """MuJoCo's, tried in this order unless `MUJOCO_GL` names one: a GPU, no GPU, a Mac, a screen."""
+
+SUFFIXES = (".mp4", ".gif", ".png")
+STILLS = 4
+"""Moments in one picture."""
 
 INSTALL_RENDERER = (
     "What to do: install a renderer that needs no screen, such as Mesa's (Debian and Ubuntu: apt-get install "
@@ -58,12 +62,12 @@ def find_renderer() -> str:
     raise RunError(f"{failed} {INSTALL_RENDERER}")
 
 
-def load_actor(run: Path) -> tuple[RunConfig, Environment, Callable[[Key, Array], Array], int]:
+def load_actor(run: Path) -> tuple[RunConfig, Environment, Act, int]:
     """The agent of a run's latest checkpoint.
 
     Returns:
-        The run's configuration, its environment with physics on the host, an `act(key, obs) -> action`, and the
-        checkpoint's step.
+        The run's configuration, its environment with physics on the host where it has the choice, an
+        `act(key, obs) -> action`, and the checkpoint's step.
 
     Raises:
         RunError: `run` holds no run or no checkpoint, or its environment cannot be drawn.
@@ -80,9 +84,8 @@ def load_actor(run: Path) -> tuple[RunConfig, Environment, Callable[[Key, Array]
         reason = getattr(error, "strerror", None) or error
         raise RunError(f"{run} holds no run: cannot read {run / 'config.json'} ({reason}).") from error
     own_env = loop.make_environment(config)
-    env = own_env if not own_env.compiled else loop.make_environment(dataclasses.replace(config, backend="mujoco"))
-    if env.view is None:
-        raise RunError(f"{config.env} has nothing to draw: it has no MuJoCo model.")
+    env = own_env if own_env.backend != "mjx" else loop.make_environment(dataclasses.replace(config, backend="mujoco"))
+    _check_view(env, config.env)
     explorer = loop.make_run_explorer(config, own_env)
     init = loop.make_programs(config, own_env, explorer).init
     restored = Checkpoints(run / "checkpoints").restore_latest(jax.eval_shape(init) if own_env.compiled else init())
@@ -93,54 +96,92 @@ def load_actor(run: Path) -> tuple[RunConfig, Environment, Callable[[Key, Array]
     return config, env, act, restored.step
 
 
-def episode(env: Environment, act: Callable[[Key, Array], Array], seed: int, num_steps: int) -> np.ndarray:
-    """Generalised positions of `num_steps` of acting, `[num_steps + 1, nq]`, episode after episode."""
+def load_random(name: str) -> tuple[RunConfig, Environment, Act]:
+    """An environment by its name, and uniform actions.
+
+    Raises:
+        ValueError: there is no such environment.
+        RunError: it cannot be drawn.
+    """
+    import jax
+
+    from experiments import loop
+    from experiments.config import preset_config
+
+    config = dataclasses.replace(preset_config("laptop", name), method="random")
+    env = loop.make_environment(config)
+    env = env if env.backend != "mjx" else loop.make_environment(dataclasses.replace(config, backend="mujoco"))
+    _check_view(env, name)
+    return config, env, jax.jit(loop.make_run_explorer(config, env).act_uniformly)
+
+
+def _check_view(env: Environment, name: str) -> None:
+    if env.view is None:
+        raise RunError(f"{name} has nothing to draw: its environment has no view.")
+
+
+def episode(env: Environment, act: Act, seed: int, num_steps: int) -> list[EnvState]:
+    """The states of `num_steps` of acting, `num_steps + 1` of them, episode after episode."""
     import jax
 
     from envs.wrappers import make_collect
 
-    assert env.view is not None
     collect = make_collect(env, 1)
+    if env.compiled:
+        collect = jax.jit(collect, static_argnums=(2, 3))
     key = jax.random.key(seed)
-    state = env.reset(jax.random.fold_in(key, 0))
-    positions = [np.array(env.view.qpos(state))]
+    states = [env.reset(jax.random.fold_in(key, 0))]
     for step in range(num_steps):
-        state, _, _ = collect(jax.random.fold_in(key, step + 1), state, act, 1)
-        positions.append(np.array(env.view.qpos(state)))
-    return np.stack(positions)
+        states.append(collect(jax.random.fold_in(key, step + 1), states[-1], act, 1)[0])
+    return states
 
 
-def write_video(path: Path, env: Environment, positions: np.ndarray, *, camera: str, height: int, width: int) -> None:
-    """Draw the positions and write them as a video in real time, whole or not at all.
+def draw(
+    path: Path, env: Environment, states: Sequence[EnvState], *, camera: str | None, height: int, width: int
+) -> None:
+    """Draw states and write them, whole or not at all.
+
+    Args:
+        path: a video in real time (`.mp4`, `.gif`), or one picture (`.png`) of `STILLS` states, evenly spaced.
+        env: whose states they are; it has a view.
+        states: what to draw.
+        camera: one of the view's; its first by default.
+        height: of a frame, pixels.
+        width: of a frame, pixels.
 
     Raises:
         RunError: no video writer, or the file cannot be written.
+        ValueError: the view has no such camera, or nothing is known that ends like `path`.
     """
-    import mujoco
-
     try:
         import imageio.v2 as imageio
         import imageio_ffmpeg  # noqa: F401
     except ImportError as error:
         raise RunError(INSTALL_WRITER) from error
+    from jaxplore import validate
+
     assert env.view is not None
-    data = mujoco.MjData(env.view.model)
+    camera = camera or env.view.cameras[0]
+    validate.one_of("--camera", camera, env.view.cameras)
+    validate.one_of("the ending of --out", path.suffix, SUFFIXES)
     draft = path.with_suffix(f".tmp{path.suffix}")
     try:
-        with (
+        if path.suffix == ".png":
+            chosen = [states[i] for i in np.linspace(0, len(states) - 1, min(STILLS, len(states))).round().astype(int)]
+            stills = list(env.view.frames(chosen, height, width, camera))
+            imageio.imwrite(draft, np.concatenate(stills, axis=1))
+        else:
+            options = {"fps": round(1 / env.spec.dt), "macro_block_size": 2} if path.suffix == ".mp4" else {}
             # JAX warns of the fork that starts ffmpeg; nothing but ffmpeg runs in it.
-            warnings.catch_warnings(action="ignore", category=RuntimeWarning),
-            mujoco.Renderer(env.view.model, height, width) as renderer,
-            imageio.get_writer(draft, fps=round(1 / env.spec.dt), macro_block_size=2) as writer,
-        ):
-            for qpos in positions:
-                data.qpos[:] = qpos
-                mujoco.mj_forward(env.view.model, data)
-                renderer.update_scene(data, camera=camera)
-                writer.append_data(renderer.render())
+            with (
+                warnings.catch_warnings(action="ignore", category=RuntimeWarning),
+                imageio.get_writer(draft, **options) as writer,
+            ):
+                for frame in env.view.frames(states, height, width, camera):
+                    writer.append_data(frame)
         draft.replace(path)
     except OSError as error:
-        raise disk_error("write the video", path, error) from error
+        raise disk_error("write the picture", path, error) from error
     finally:
         draft.unlink(missing_ok=True)
 
@@ -148,16 +189,19 @@ def write_video(path: Path, env: Environment, positions: np.ndarray, *, camera: 
 def main(argv: Sequence[str] | None = None) -> int:
     """Draw a video; the exit status is 0, 1 with a message, or 2 for bad input."""
     parser = argparse.ArgumentParser(prog="python -m experiments.render", description=__doc__)
-    parser.add_argument("run", type=Path, help="directory of a run")
+    parser.add_argument("run", type=Path, nargs="?", help="directory of a run")
+    parser.add_argument("--env", help="instead of a run: an environment, to see it under uniform actions")
     parser.add_argument("--seed", type=int, default=0, help="of the start and of what the agent draws (default: 0)")
     parser.add_argument("--steps", type=int, help="steps to act (default: one episode)")
-    parser.add_argument(
-        "--camera", choices=("track", "overview"), default="track", help="follow the agent, or see all (default: track)"
-    )
+    parser.add_argument("--camera", help="where to look from; the ant's: track, overview (default: the usual one)")
     parser.add_argument(
         "--size", type=int, nargs=2, default=(480, 640), metavar=("HEIGHT", "WIDTH"), help="(default: 480 640)"
     )
-    parser.add_argument("--out", type=Path, help="the video to write (default: RUN/CAMERA.mp4)")
+    parser.add_argument(
+        "--out",
+        type=Path,
+        help=f"the video to write: .mp4, .gif, or a .png of {STILLS} moments (default: RUN/CAMERA.mp4, ENV.mp4)",
+    )
     arguments = parser.parse_args(argv)
     if arguments.seed < 0:
         parser.error(f"--seed={arguments.seed}. Allowed: 0 or more.")
@@ -165,23 +209,44 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"--steps={arguments.steps}. Allowed: 1 or more.")
     if any(not 16 <= size <= 1280 or size % 2 for size in arguments.size):
         parser.error(f"--size={' '.join(map(str, arguments.size))}. Allowed: even numbers from 16 to 1280.")
-    path = arguments.out or arguments.run / f"{arguments.camera}.mp4"
+    if (arguments.run is None) == (arguments.env is None):
+        parser.error("give the directory of a run, or --env to see an environment under uniform actions.")
     try:
-        if not (arguments.run / "config.json").is_file():
+        if arguments.run is not None and not (arguments.run / "config.json").is_file():
             raise RunError(f"{arguments.run} holds no run (no config.json). Give the --out of a run.")
-        os.environ["MUJOCO_GL"] = find_renderer()
+        # MuJoCo is about to be imported, and takes its renderer then; whether one is needed is known only later.
+        failed = None
+        try:
+            os.environ["MUJOCO_GL"] = find_renderer()
+        except RunError as error:
+            os.environ.pop("MUJOCO_GL", None)
+            failed = error
 
         from experiments.run import use_compilation_cache
 
         use_compilation_cache()
-        config, env, act, step = load_actor(arguments.run)
-        positions = episode(env, act, arguments.seed, arguments.steps or env.spec.episode_steps)
+        if arguments.env is not None:
+            (config, env, act), after = load_random(arguments.env), ""
+        else:
+            config, env, act, step = load_actor(arguments.run)
+            after = f" after {step:,} steps"
+        assert env.view is not None
+        if env.view.needs_renderer and failed:
+            raise failed
+        name = arguments.camera or env.view.cameras[0]
+        default = (
+            Path(f"{arguments.env.replace(':', '-').replace('/', '-')}.mp4")
+            if arguments.env
+            else arguments.run / f"{name}.mp4"
+        )
+        path = arguments.out or default
+        states = episode(env, act, arguments.seed, arguments.steps or env.spec.episode_steps)
         height, width = arguments.size
-        write_video(path, env, positions, camera=arguments.camera, height=height, width=width)
+        draw(path, env, states, camera=arguments.camera, height=height, width=width)
     except (RunError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    print(f"{config.method} on {config.env} after {step:,} steps, {len(positions) - 1:,} steps of acting: {path}")
+    print(f"{config.method} on {config.env}{after}, {len(states) - 1:,} steps of acting: {path}")
     return 0
 
 

@@ -51,7 +51,13 @@ class Sizes(NamedTuple):
     """What a method must know of an environment."""
 
     obs: int
+    """`O`."""
     action: int
+    """`A`."""
+    discrete: bool = False
+    """Whether an action is one of `A` choices, as a one-hot vector; otherwise entries are numbers in [-1, 1]."""
+    one_hot_obs: bool = False
+    """Whether an observation is one of `O` states, as a one-hot vector."""
 
 
 class Method(NamedTuple):

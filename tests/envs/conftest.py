@@ -30,8 +30,9 @@ def make_bead():
             frame_skip=2,
             start=lambda key: (jax.random.uniform(key, (1,)), jnp.zeros(1)),
             observe=lambda xp, qpos_before, qpos, qvel: xp.concatenate([qpos, qvel]),
-            reward=lambda xp, action, obs: obs[1] - 0.5 * action[0],
+            reward=lambda xp, action, qpos_before, qpos, qvel: qvel[0] - 0.5 * action[0],
             coverage=Coverage(1, lambda obs: jnp.int32(0), "rails"),
+            cameras=(),
         )
         return choose_engine(backend).make_environment(task, obs_noise)
 

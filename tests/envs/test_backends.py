@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import envs
-from envs.base import check_choice, choose_engine
+from envs.base import choose_engine
 
 BACKENDS = ["mujoco", "mjx"]
 
@@ -32,7 +32,7 @@ def test_closed_form(make_bead, backend):
         np.testing.assert_allclose(transition.next_obs, [x, v], atol=1e-6)
         np.testing.assert_allclose(transition.reward, v - 0.5 * push, atol=1e-6)
     assert (env.backend, env.compiled) == (backend, backend == "mjx")
-    np.testing.assert_allclose(env.view.qpos(state), [x], atol=1e-6)
+    assert (env.view.cameras, env.view.needs_renderer) == ((), True)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -155,10 +155,8 @@ def test_auto_takes_the_host_where_jax_runs_on_a_cpu(make_bead, monkeypatch):
 
 
 def test_names_the_nearest_match():
-    with pytest.raises(ValueError, match=r"backend is 'mujocoo'. Did you mean 'mujoco'\? Allowed: auto, mjx, mujoco"):
+    with pytest.raises(ValueError, match=r"backend='mujocoo' .*Did you mean 'mujoco'\? Allowed: auto, mjx, mujoco"):
         choose_engine("mujocoo")
-    with pytest.raises(ValueError, match=r"colour is 'zzz'. Allowed: blue, red"):
-        check_choice("colour", "zzz", {"red": 1, "blue": 2})
 
 
 def test_make_by_name():
@@ -166,7 +164,7 @@ def test_make_by_name():
 
 
 def test_make_refuses_what_it_does_not_know():
-    with pytest.raises(ValueError, match=r"'ant_mase'. Did you mean 'ant_maze'\?"):
+    with pytest.raises(ValueError, match=r"'ant_mase' .*Did you mean 'ant_maze'\?"):
         envs.make("ant_mase")
-    with pytest.raises(ValueError, match=r"option of 'ant_maze' is 'obs_nois'. Did you mean 'obs_noise'\? Allowed: "):
+    with pytest.raises(ValueError, match=r"option of 'ant_maze'='obs_nois' .*Did you mean 'obs_noise'\? Allowed: "):
         envs.make("ant_maze", obs_nois=0.1)

@@ -78,7 +78,7 @@ def test_without_any_renderer_all_are_tried(monkeypatch: pytest.MonkeyPatch):
 def test_without_imageio_it_is_named(finished, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(RunError, match=r'pip install -e "\.\[render\]"'):
-        render.write_video(tmp_path / "a.mp4", None, np.zeros((1, 1)), camera="track", height=16, width=16)  # type: ignore[arg-type]
+        render.draw(tmp_path / "a.mp4", None, [], camera="track", height=16, width=16)  # type: ignore[arg-type]
 
 
 def test_what_holds_no_run_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -102,10 +102,13 @@ def test_an_environment_without_looks_is_said(point: str, tmp_path: Path):
 def test_the_agent_acts_as_it_was_saved(finished):
     config, env, act, step = render.load_actor(finished.out)
     assert (config.env, env.compiled, step) == ("ant_maze", False, 81)
-    positions = render.episode(env, act, seed=1, num_steps=5)
-    assert positions.shape == (6, 15)
-    np.testing.assert_array_equal(positions, render.episode(env, act, seed=1, num_steps=5))
-    assert not np.array_equal(positions, render.episode(env, act, seed=2, num_steps=5))
+
+    def observed(seed: int) -> np.ndarray:
+        return np.stack([state.obs for state in render.episode(env, act, seed, num_steps=5)])
+
+    assert observed(1).shape == (6, 31)
+    np.testing.assert_array_equal(observed(1), observed(1))
+    assert not np.array_equal(observed(1), observed(2))
 
 
 @pytest.mark.parametrize(
@@ -114,7 +117,7 @@ def test_the_agent_acts_as_it_was_saved(finished):
         (("--steps=0",), "--steps=0. Allowed: 1 or more"),
         (("--seed=-1",), "--seed=-1. Allowed: 0 or more"),
         (("--size", "4000", "640"), "--size=4000 640. Allowed: even numbers from 16 to 1280"),
-        (("--camera=side",), "invalid choice: 'side'"),
+        (("--env=ant_maze",), "give the directory of a run, or --env"),
     ],
 )
 def test_bad_flags_are_refused(words: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]):

@@ -233,7 +233,7 @@ def test_help_shows_every_setting_with_its_default(
         ("--env=ant_mase", r"env='ant_mase' is not known\. Did you mean 'ant_maze'\? Allowed: ant_maze"),
         ("--method=implict", r"--method='implict' is not known\. Did you mean 'implicit'\? Allowed: implicit, random"),
         ("--preset=papre", r"preset='papre' is not known\. Did you mean 'paper'\? Allowed: laptop, paper, smoke"),
-        ("--backend=mjy", r"backend is 'mjy'\. Did you mean 'mjx'\? Allowed: auto, mjx, mujoco"),
+        ("--backend=mjy", r"backend='mjy' .*Did you mean 'mjx'\? Allowed: auto, mjx, mujoco"),
         ("--svgd.kernel=rbff", r"--svgd\.kernel='rbff' is not known\. Did you mean 'rbf'\? Allowed: imq, rbf"),
         ("--sac.activation=rleu", r"--sac\.activation='rleu' is not known\. Did you mean 'relu'\? Allowed: leaky_relu"),
         ("--num-seeds=0", r"--num-seeds=0 is out of range\. Allowed: a whole number, 1 or more"),

@@ -1,0 +1,65 @@
+"""Ways to draw an environment: MuJoCo's own renderer, and sketches of what has no MuJoCo model."""
+# pyright: reportAttributeAccessIssue=false
+# mujoco ships no stubs.
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from envs.base import EnvState, View
+
+SKETCH_DPI = 100
+
+
+def make_mujoco_view(model: Any, qpos: Callable[[EnvState], Any], cameras: tuple[str, ...]) -> View:
+    """MuJoCo's renderer. It takes an OpenGL library, and `MUJOCO_GL` set before MuJoCo is imported.
+
+    Args:
+        model: a `mujoco.MjModel`.
+        qpos: `qpos(state) -> [nq]`, the model's positions in a state.
+        cameras: names of the model's cameras, the usual one first.
+    """
+
+    def frames(states: Sequence[EnvState], height: int, width: int, camera: str) -> Iterator[np.ndarray]:
+        import mujoco
+
+        data = mujoco.MjData(model)
+        with mujoco.Renderer(model, height, width) as renderer:
+            for state in states:
+                data.qpos[:] = jax.device_get(qpos(state))
+                mujoco.mj_forward(model, data)
+                renderer.update_scene(data, camera=camera)
+                yield renderer.render()
+
+    return View(frames, cameras, True)
+
+
+def make_sketch_view(limits: tuple[float, float, float, float], draw: Callable[[Any, EnvState], None]) -> View:
+    """Drawn with matplotlib, on empty axes of equal scale.
+
+    Args:
+        limits: `(x_min, x_max, y_min, y_max)` of what is seen; the rest of the picture's shape is filled.
+        draw: `draw(axes, state)` draws one state, of NumPy arrays, onto matplotlib axes.
+    """
+
+    def frames(states: Sequence[EnvState], height: int, width: int, camera: str) -> Iterator[np.ndarray]:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(width / SKETCH_DPI, height / SKETCH_DPI), dpi=SKETCH_DPI)
+        canvas = FigureCanvasAgg(figure)
+        axes = figure.add_axes((0, 0, 1, 1))
+        for state in states:
+            axes.clear()
+            axes.set_axis_off()
+            x_min, x_max, y_min, y_max = limits
+            axes.set(xlim=(x_min, x_max), ylim=(y_min, y_max))
+            axes.set_aspect("equal", adjustable="datalim")
+            # Keys are no NumPy arrays, and no picture needs one.
+            draw(axes, jax.device_get(state.replace(key=())))
+            canvas.draw()
+            yield np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+    return View(frames, ("sketch",), False)
