@@ -5,16 +5,12 @@ import json
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, get_args
+from typing import Any, Literal, cast, get_args
 
 import envs
+from experiments import presets
 from jaxplore import validate
-from jaxplore.behaviours import ImaginationConfig
-from jaxplore.beliefs import FitConfig
-from jaxplore.dynamics import DynamicsConfig
 from jaxplore.methods import METHODS, ExplorationConfig
-from jaxplore.sac import SACConfig
-from jaxplore.svgd import SVGDConfig
 from jaxplore.validate import Checks
 
 Preset = Literal["laptop", "paper", "smoke"]
@@ -62,37 +58,6 @@ class RunConfig:
             )
 
 
-LAPTOP = ExplorationConfig(
-    dynamics=DynamicsConfig(hidden=(64, 64)),
-    svgd=SVGDConfig(temperature=0.02, tempering="per_datum", repulsion_points="perturbed", accept_improper=True),
-    fit=FitConfig(lr=1e-3, weight_decay=0.0, batch_size=128, epochs=0, steps=60, restart=False),
-    imagination=ImaginationConfig(
-        horizon=25,
-        num_rollouts=1,
-        num_random_rollouts=0,
-        updates_per_rollout=300,
-        real_updates=0,
-        current_fraction=0.5,
-        mover="per_rollout",
-        bound=10.0,
-        replay_capacity=9_600,
-        restart_every=12,
-        normalize_reward=True,
-    ),
-    sac=SACConfig(hidden=(128, 128), batch_size=256, log_std_min=-5.0),
-)
-"""Settings for a laptop without a GPU: see the README for what was tried."""
-
-SMOKE = dataclasses.replace(
-    LAPTOP,
-    dynamics=DynamicsConfig(hidden=(32, 32)),
-    fit=dataclasses.replace(LAPTOP.fit, steps=10),
-    imagination=dataclasses.replace(LAPTOP.imagination, horizon=10, num_actors=32, updates_per_rollout=20),
-    sac=dataclasses.replace(LAPTOP.sac, hidden=(32, 32), batch_size=64),
-)
-"""The laptop's settings cut down until nothing can be learned: it shows that everything runs."""
-
-
 def preset_config(preset: str, env: str = "ant_maze") -> RunConfig:
     """The configuration that a preset stands for.
 
@@ -101,15 +66,7 @@ def preset_config(preset: str, env: str = "ant_maze") -> RunConfig:
     """
     validate.one_of("preset", preset, PRESETS)
     validate.one_of("env", env, envs.FACTORIES)
-    if preset == "paper":
-        return RunConfig(env=env, preset="paper", obs_noise=PAPER_OBS_NOISE.get(env, 0.0))
-    if preset == "smoke":
-        return RunConfig(env=env, preset="smoke", steps=600, checkpoint_every=200, explorer=SMOKE)
-    return RunConfig(env=env, explorer=LAPTOP)
-
-
-PAPER_OBS_NOISE = {"ant_maze": 0.02}
-"""Observation noise in nnaisense/max's commands, raw units; the paper is silent."""
+    return RunConfig(env=env, preset=cast(Preset, preset), **presets.settings(preset, env))
 
 
 def to_json(config: Any) -> str:

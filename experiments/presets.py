@@ -1,0 +1,59 @@
+"""What the presets set, per environment. An environment that is not in the table has the defaults."""
+
+import dataclasses
+from typing import Any
+
+from jaxplore.behaviours import ImaginationConfig
+from jaxplore.beliefs import FitConfig
+from jaxplore.dynamics import DynamicsConfig
+from jaxplore.methods import ExplorationConfig
+from jaxplore.sac import SACConfig
+from jaxplore.svgd import SVGDConfig
+
+LAPTOP = ExplorationConfig(
+    dynamics=DynamicsConfig(hidden=(64, 64)),
+    svgd=SVGDConfig(temperature=0.02, tempering="per_datum", repulsion_points="perturbed", accept_improper=True),
+    fit=FitConfig(lr=1e-3, weight_decay=0.0, batch_size=128, epochs=0, steps=60, restart=False),
+    imagination=ImaginationConfig(
+        horizon=25,
+        num_rollouts=1,
+        num_random_rollouts=0,
+        updates_per_rollout=300,
+        real_updates=0,
+        current_fraction=0.5,
+        mover="per_rollout",
+        bound=10.0,
+        replay_capacity=9_600,
+        restart_every=12,
+        normalize_reward=True,
+    ),
+    sac=SACConfig(hidden=(128, 128), batch_size=256, log_std_min=-5.0),
+)
+"""Settings for a laptop without a GPU: see `results/ant_maze_laptop/TUNING.md` for what was tried."""
+
+SMOKE = dataclasses.replace(
+    LAPTOP,
+    dynamics=DynamicsConfig(hidden=(32, 32)),
+    fit=dataclasses.replace(LAPTOP.fit, steps=10),
+    imagination=dataclasses.replace(LAPTOP.imagination, horizon=10, num_actors=32, updates_per_rollout=20),
+    sac=dataclasses.replace(LAPTOP.sac, hidden=(32, 32), batch_size=64),
+)
+"""The laptop's settings cut down until nothing can be learned: it shows that everything runs."""
+
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "laptop": {"explorer": LAPTOP},
+    "paper": {"explorer": ExplorationConfig()},
+    "smoke": {"explorer": SMOKE, "steps": 600, "checkpoint_every": 200},
+}
+"""Preset -> fields of `RunConfig`."""
+
+ENVIRONMENTS: dict[str, dict[str, dict[str, Any]]] = {
+    # Observation noise in nnaisense/max's commands, raw units; the paper is silent.
+    "ant_maze": {"paper": {"obs_noise": 0.02}},
+}
+"""Environment -> preset -> the fields in which it departs from the defaults. A new environment adds its own."""
+
+
+def settings(preset: str, env: str) -> dict[str, Any]:
+    """The fields of `RunConfig` that a preset sets in an environment; both names must be known."""
+    return {**DEFAULTS[preset], **ENVIRONMENTS.get(env, {}).get(preset, {})}
