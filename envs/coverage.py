@@ -13,13 +13,19 @@ on both axes (nnaisense/max, issue 3, the maintainer's answer: "# of visited blo
 - An observation outside all cells (inside a wall, by noise) counts for nothing.
 """
 
+import math
 from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from envs.base import Coverage
+from jaxplore import validate
 from jaxplore.types import Array
+
+MAX_CELLS = 1_000_000
+"""Cells that a grid may have: a run keeps and saves one byte for each."""
 
 
 def make_box_coverage(
@@ -41,6 +47,71 @@ def make_box_coverage(
         return jnp.where(inside.any(), jnp.argmax(inside), -1).astype(jnp.int32)
 
     return Coverage(len(boxes), cell, unit)
+
+
+def make_grid_coverage(
+    dims: Sequence[int],
+    low: Sequence[float],
+    high: Sequence[float],
+    bins: int | Sequence[int],
+    unit: str,
+    *,
+    clip: bool = True,
+    reachable: int | None = None,
+) -> Coverage:
+    """Cells that are the boxes of a regular grid over some entries of the observation.
+
+    Cells are numbered with the last entry's bin running fastest: with `bins` of 2 and 3, cell 4 is bin 1 of the first
+    entry and bin 1 of the second. An observation with an entry of `dims` that is not finite lies in no cell.
+
+    Args:
+        dims: indices of the entries in the observation, each at most once.
+        low: lower end of the grid along each entry, in the entry's own unit.
+        high: upper end.
+        bins: bins along each entry, or one number for all.
+        unit: what a cell is, for axis labels.
+        clip: whether a value beyond an end counts as in the bin at that end. Otherwise it lies in no cell; the lower
+            border belongs to a bin, the upper one does not.
+        reachable: how many of the cells can be reached, where that is known.
+
+    Raises:
+        ValueError: no entry, one that is negative or named twice, an end too many or too few or not finite, `low` not
+            below `high`, `bins` below 1, or more than `MAX_CELLS` cells.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> grid = make_grid_coverage((0, 2), (0.0, -1.0), (1.0, 1.0), (2, 3), "boxes")
+        >>> int(grid.cell(jnp.array([0.7, 9.0, 0.0]))), grid.num_cells
+        (4, 6)
+    """
+    dims = tuple(dims)
+    counts = (bins,) * len(dims) if isinstance(bins, int) else tuple(bins)
+    if not dims or len(set(dims)) < len(dims):
+        raise ValueError(f"dims={dims!r}. Allowed: one or more entries of the observation, each once.")
+    for dim in dims:
+        validate.at_least("dims", dim, 0)
+    for name, values in (("low", low), ("high", high), ("bins", counts)):
+        if len(values) != len(dims):
+            raise ValueError(f"{name}={values!r}. Allowed: {len(dims)} numbers, one for each of dims={dims!r}.")
+    for count, lowest, highest in zip(counts, low, high, strict=True):
+        validate.at_least("bins", count, 1)
+        validate.in_range("low", lowest)
+        validate.in_range("high", highest, lowest, open_low=True)
+    if math.prod(counts) > MAX_CELLS:
+        raise ValueError(f"bins={counts!r} are {math.prod(counts):,} cells. Allowed: at most {MAX_CELLS:,}.")
+    borders = [np.linspace(*ends) for ends in zip(low, high, np.add(counts, 1).tolist(), strict=True)]
+
+    def cell(obs: Array) -> Array:
+        index, inside = jnp.int32(0), jnp.bool_(True)
+        for dim, edges, count in zip(dims, borders, counts, strict=True):
+            value = obs[dim]
+            # How many borders lie at or below it: 0 below the grid, count + 1 above.
+            passed = jnp.searchsorted(jnp.asarray(edges, obs.dtype), value, side="right").astype(jnp.int32)
+            inside &= jnp.isfinite(value) & (clip | ((passed > 0) & (passed <= count)))
+            index = index * count + jnp.clip(passed - 1, 0, count - 1)
+        return jnp.where(inside, index, -1)
+
+    return Coverage(math.prod(counts), cell, unit, reachable)
 
 
 def init(coverage: Coverage) -> Array:

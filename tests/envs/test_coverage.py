@@ -86,3 +86,65 @@ def test_nothing_seen_is_0_and_everything_seen_is_1():
 def test_full_tour_of_the_corridor_is_7_of_7():
     visited = coverage.update_from_obs(MAZE, coverage.init(MAZE), obs_at(CENTRES))
     assert coverage.fraction(visited) == 1
+
+
+def brute_force(obs, dims, low, high, bins, clip):
+    """The cell by the definition, in NumPy and one entry at a time."""
+    index = []
+    for dim, lowest, highest, count in zip(dims, low, high, bins, strict=True):
+        i = int(np.floor((obs[dim] - lowest) / (highest - lowest) * count))
+        if not clip and not 0 <= i < count:
+            return -1
+        index.append(min(max(i, 0), count - 1))
+    return int(np.ravel_multi_index(index, bins))
+
+
+@pytest.mark.parametrize("clip", [True, False])
+def test_grid_cells_are_the_bins_of_each_entry(clip):
+    # 3 entries of 5 with borders that are no round numbers; half of the points lie beyond an end
+    grid = ((3, 0, 4), (-1.7, 0.3, -9.1), (2.2, 0.9, -1.0), (4, 3, 5))
+    points = np.random.default_rng(0).uniform(-1, 1, (400, 5)).astype(np.float32) * np.array([2, 9, 9, 4, 12])
+    cover = coverage.make_grid_coverage(*grid, "boxes", clip=clip)
+    got = jax.jit(jax.vmap(cover.cell))(jnp.asarray(points, jnp.float32))
+    np.testing.assert_array_equal(got, [brute_force(obs, *grid, clip) for obs in points])
+    assert got.dtype == jnp.int32
+    assert cover.num_cells == 60
+    assert ((np.asarray(got) == -1).mean() > 0.5) == (not clip)
+
+
+@pytest.mark.parametrize(
+    ("value", "clipped", "outside"),
+    [(-1.001, 0, -1), (-1.0, 0, 0), (-0.001, 0, 0), (0.0, 1, 1), (0.999, 1, 1), (1.0, 1, -1), (1e30, 1, -1)],
+)
+def test_grid_borders(value, clipped, outside):
+    # the lower border belongs to a bin, the upper one to the next
+    for clip, cell in ((True, clipped), (False, outside)):
+        grid = coverage.make_grid_coverage((0,), (-1.0,), (1.0,), 2, "halves", clip=clip)
+        assert grid.cell(jnp.array([value])) == cell
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_grid_puts_what_is_not_finite_nowhere(value):
+    grid = coverage.make_grid_coverage((0, 1), (0.0, 0.0), (1.0, 1.0), 2, "boxes")
+    assert grid.cell(jnp.array([0.5, value])) == -1
+    assert grid.cell(jnp.array([value, 0.5])) == -1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"dims": ()}, r"dims=\(\)\. Allowed: one or more"),
+        ({"dims": (1, 1)}, r"dims=\(1, 1\)\. Allowed: .* each once"),
+        ({"dims": (0, -1)}, "dims=-1 is out of range"),
+        ({"low": (0.0,)}, r"low=\(0\.0,\)\. Allowed: 2 numbers"),
+        ({"bins": (2, 2, 2)}, r"bins=\(2, 2, 2\)\. Allowed: 2 numbers"),
+        ({"bins": (2, 0)}, "bins=0 is out of range. Allowed: a whole number, 1 or more"),
+        ({"low": (0.0, np.inf)}, "low=inf is out of range"),
+        ({"high": (1.0, 0.0)}, r"high=0\.0 is out of range\. Allowed: a finite number in \(0"),
+        ({"bins": 1001}, r"bins=\(1001, 1001\) are 1,002,001 cells\. Allowed: at most 1,000,000"),
+    ],
+)
+def test_bad_grids_are_refused(change, message):
+    good = {"dims": (0, 1), "low": (0.0, 0.0), "high": (1.0, 1.0), "bins": 2, "unit": "boxes"}
+    with pytest.raises(ValueError, match=message):
+        coverage.make_grid_coverage(**{**good, **change})
