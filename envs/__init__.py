@@ -6,10 +6,12 @@ from typing import Any
 
 from envs.ant_maze import make_ant_maze
 from envs.base import Coverage, Environment, EnvSpec, EnvState, FloorPlan
+from envs.nchain import make_nchain
 from jaxplore import validate
 
 FACTORIES: dict[str, Callable[..., Environment]] = {
     "ant_maze": make_ant_maze,
+    "nchain": make_nchain,
 }
 """Name of an environment, and what makes it. A new environment is one line here."""
 

@@ -6,6 +6,7 @@ that was never interrupted.
 """
 
 import dataclasses
+import inspect
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -67,8 +68,13 @@ class Programs(NamedTuple):
 
 
 def make_environment(config: RunConfig) -> Environment:
-    """The environment that a configuration names."""
-    return envs.make(config.env, backend=config.backend, obs_noise=config.obs_noise)
+    """The environment that a configuration names.
+
+    One that draws something of its own once and for all, such as the chain's flip-states, draws it from the run's first
+    seed: seeds carried side by side share it.
+    """
+    own = {"seed": config.seed} if "seed" in inspect.signature(envs.FACTORIES[config.env]).parameters else {}
+    return envs.make(config.env, backend=config.backend, obs_noise=config.obs_noise, **own)
 
 
 def make_run_explorer(config: RunConfig, env: Environment) -> Explorer:

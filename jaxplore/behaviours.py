@@ -17,8 +17,8 @@ from jaxplore import dynamics, imagination, normalizer, replay
 from jaxplore.beliefs import Belief
 from jaxplore.dynamics import Normalizers
 from jaxplore.imagination import Mover, Reward
+from jaxplore.learner import Learner
 from jaxplore.replay import Replay
-from jaxplore.sac import Learner, SACState
 from jaxplore.types import Array, Key, Metrics, Transition
 from jaxplore.validate import Checks
 
@@ -109,7 +109,7 @@ class ImaginationConfig:
 class ImaginationState:
     """What a policy trained in imagination carries."""
 
-    learner: SACState
+    learner: Any
     imagined: Replay[Transition]
     age: Array
     """Rounds that the policy has lived through, int32."""
@@ -169,16 +169,16 @@ def make_imagination(
 
     def train(
         key: Key,
-        state: SACState,
+        state: Any,
         draw: Callable[[Key], Transition],
         normalizers: Normalizers,
         reward_std: Array,
         num_updates: int | Array,
         metrics: Metrics,
-    ) -> tuple[SACState, Metrics]:
+    ) -> tuple[Any, Metrics]:
         """`num_updates` updates, which may be a traced number, on batches that `draw` gives."""
 
-        def one_update(i: Array, carry: tuple[SACState, Metrics]) -> tuple[SACState, Metrics]:
+        def one_update(i: Array, carry: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
             draw_key, update_key = jax.random.split(jax.random.fold_in(key, i))
             batch = draw(draw_key)
             batch = batch._replace(
@@ -288,6 +288,63 @@ def make_imagination(
     return Behaviour(init, improve, lambda state: learner.actor(state.learner), act)
 
 
+@dataclass(frozen=True)
+class ModelFreeConfig:
+    """How a learner is trained on real transitions alone, with the environment's own reward."""
+
+    updates_per_round: int = 25
+    """Updates after each round. 25: one for each step of a round of 25."""
+    normalize_obs: bool = True
+    """Whether the learner sees observations less their mean and over their standard deviation. One-hot observations
+    always stay as they are."""
+    act_greedily: bool = False
+    """Whether the real environment gets the policy's best action or one that is drawn to explore."""
+
+    def __post_init__(self) -> None:
+        Checks(self).at_least("updates_per_round", 1)
+
+
+def make_model_free(
+    learner: Learner, obs_size: int, action_size: int, config: ModelFreeConfig | None = None
+) -> Behaviour:
+    """Train a learner on the real transitions and the environment's own reward: no belief, no intrinsic reward.
+
+    The learner lives as long as the run; each round goes on from where the last one stopped, on batches drawn from all
+    real data.
+
+    Args:
+        learner: such as `make_ddqn` or `make_sac` gives.
+        obs_size: `O`.
+        action_size: `A`.
+        config: how much of everything. `normalize_obs` is done as it says, whatever the observations are.
+
+    Returns:
+        A `Behaviour`. The metrics are the learner's, from the last update.
+    """
+    config = config or ModelFreeConfig()
+
+    def see(normalizers: Normalizers, obs: Array) -> Array:
+        return normalizer.normalize(normalizers.obs, obs) if config.normalize_obs else obs
+
+    def act(key: Key, actor: Any, normalizers: Normalizers, obs: Array) -> Array:
+        seen = see(normalizers, obs)
+        return learner.act_greedily(actor, seen) if config.act_greedily else learner.act(key, actor, seen)
+
+    def improve(key: Key, state: Any, experience: Experience) -> tuple[Any, Metrics]:
+        def one_update(i: Array, carry: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
+            draw_key, update_key = jax.random.split(jax.random.fold_in(key, i))
+            batch = replay.sample(draw_key, experience.data, learner.batch_size)
+            batch = batch._replace(
+                obs=see(experience.normalizers, batch.obs), next_obs=see(experience.normalizers, batch.next_obs)
+            )
+            return learner.update(update_key, carry[0], batch)
+
+        start = (state, _no_metrics(learner, obs_size, action_size))
+        return jax.lax.fori_loop(0, config.updates_per_round, one_update, start)
+
+    return Behaviour(learner.init, improve, learner.actor, act)
+
+
 def _no_metrics(learner: Learner, obs_size: int, action_size: int) -> Metrics:
     """Zeros in the shape of the learner's metrics, to start a loop with."""
     flag, obs = jnp.zeros(1, bool), jnp.zeros((1, obs_size))
@@ -308,11 +365,19 @@ def _reward_std(data: Replay[Transition], wanted: bool) -> Array:
     return jnp.maximum(jnp.sqrt(jnp.sum(jnp.where(held, rewards - mean, 0.0) ** 2) / count), 1e-6)
 
 
-def make_uniform(action_size: int) -> Behaviour:
-    """Uniform actions in [-1, 1], always."""
+def uniform_actions(key: Key, obs: Array, action_size: int, discrete: bool = False) -> Array:
+    """Uniform random actions for `obs [..., O]`: `[..., A]`, in [-1, 1] or, if `discrete`, one-hot."""
+    leading = obs.shape[:-1]
+    if discrete:
+        return jax.nn.one_hot(jax.random.randint(key, leading, 0, action_size), action_size)
+    return jax.random.uniform(key, (*leading, action_size), minval=-1.0, maxval=1.0)
+
+
+def make_uniform(action_size: int, discrete: bool = False) -> Behaviour:
+    """Uniform actions, always: in [-1, 1], or one of `action_size` choices."""
 
     def act(key: Key, actor: Any, normalizers: Normalizers, obs: Array) -> Array:
-        return jax.random.uniform(key, (*obs.shape[:-1], action_size), minval=-1.0, maxval=1.0)
+        return uniform_actions(key, obs, action_size, discrete)
 
     return Behaviour(
         init=lambda key: (),

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxplore import dynamics, replay
-from jaxplore.behaviours import Experience
+from jaxplore.behaviours import Experience, uniform_actions
 from jaxplore.dynamics import Normalizers
 from jaxplore.methods import ExplorationConfig, Method, Sizes
 from jaxplore.replay import Replay
@@ -96,7 +96,7 @@ def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Ex
         return behaviour.act(key, behaviour_actor, normalizers, obs)
 
     def act_uniformly(key: Key, obs: Array) -> Array:
-        return jax.random.uniform(key, (*obs.shape[:-1], sizes.action), minval=-1.0, maxval=1.0)
+        return uniform_actions(key, obs, sizes.action, sizes.discrete)
 
     def observe(state: ExplorerState, transitions: Transition, valid: Array) -> ExplorerState:
         return dataclasses.replace(

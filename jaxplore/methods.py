@@ -3,13 +3,15 @@
 Everything else is shared. To add a method, add a row; what it needs and nothing here offers is one new factory.
 """
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, get_args
 
 from jaxplore import behaviours, beliefs, rewards, validate
-from jaxplore.behaviours import Behaviour, ImaginationConfig
+from jaxplore.behaviours import Behaviour, ImaginationConfig, ModelFreeConfig
 from jaxplore.beliefs import Belief, FitConfig
+from jaxplore.ddqn import DDQNConfig, make_ddqn
 from jaxplore.dynamics import DynamicsConfig
 from jaxplore.generator import GeneratorConfig
 from jaxplore.imagination import Reward
@@ -38,6 +40,8 @@ class ExplorationConfig:
     fit: FitConfig = field(default_factory=FitConfig)
     imagination: ImaginationConfig = field(default_factory=ImaginationConfig)
     sac: SACConfig = field(default_factory=SACConfig)
+    model_free: ModelFreeConfig = field(default_factory=ModelFreeConfig)
+    ddqn: DDQNConfig = field(default_factory=DDQNConfig)
 
     def __post_init__(self) -> None:
         checks = Checks(self)
@@ -101,7 +105,22 @@ def sac_in_imagination(sizes: Sizes, config: ExplorationConfig, belief: Belief, 
 
 def uniform_actions(sizes: Sizes, config: ExplorationConfig, belief: Belief, reward: Reward) -> Behaviour:
     """Uniform random actions."""
-    return behaviours.make_uniform(sizes.action)
+    return behaviours.make_uniform(sizes.action, sizes.discrete)
+
+
+def ddqn_on_task_reward(sizes: Sizes, config: ExplorationConfig, belief: Belief, reward: Reward) -> Behaviour:
+    """Double DQN on real transitions, with the environment's own reward. Refuses actions that are not discrete."""
+    if not sizes.discrete:
+        raise ValueError(
+            f"method='ddqn' chooses one of several actions; here an action is numbers in [-1, 1], {sizes.action} of "
+            "them. Allowed: an environment with discrete actions, or a method for continuous ones, such as implicit."
+        )
+    model_free = dataclasses.replace(
+        config.model_free, normalize_obs=config.model_free.normalize_obs and not sizes.one_hot_obs
+    )
+    return behaviours.make_model_free(
+        make_ddqn(sizes.obs, sizes.action, config.ddqn), sizes.obs, sizes.action, model_free
+    )
 
 
 METHODS: dict[str, Method] = {
@@ -110,6 +129,12 @@ METHODS: dict[str, Method] = {
         generator_belief,
         variance_reward,
         sac_in_imagination,
+    ),
+    "ddqn": Method(
+        "double DQN with epsilon-greedy actions on the environment's own reward, for discrete actions",
+        no_belief,
+        no_reward,
+        ddqn_on_task_reward,
     ),
     "random": Method("uniform random actions", no_belief, no_reward, uniform_actions),
 }
