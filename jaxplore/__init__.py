@@ -5,14 +5,16 @@ network), `rewards`, `rollout` (imagination), `make_sac`, and `make_explorer`, w
 """
 
 from jaxplore import rewards
-from jaxplore.behaviours import ImaginationConfig
+from jaxplore.behaviours import ImaginationConfig, ModelFreeConfig
 from jaxplore.beliefs import Belief, FitConfig, make_generator_belief
+from jaxplore.ddqn import DDQNConfig, make_ddqn
 from jaxplore.dynamics import DynamicsConfig, Prediction
 from jaxplore.exploration import Explorer, ExplorerState, make_explorer
 from jaxplore.generator import Generator, GeneratorConfig, make_generator
 from jaxplore.imagination import rollout
+from jaxplore.learner import Learner
 from jaxplore.methods import METHODS, ExplorationConfig, Method, Sizes, get_method
-from jaxplore.sac import Learner, SACConfig, make_sac
+from jaxplore.sac import SACConfig, make_sac
 from jaxplore.svgd import (
     AmortizedSVGD,
     SVGDConfig,
@@ -27,6 +29,7 @@ __all__ = [
     "METHODS",
     "AmortizedSVGD",
     "Belief",
+    "DDQNConfig",
     "DynamicsConfig",
     "ExplorationConfig",
     "Explorer",
@@ -37,6 +40,7 @@ __all__ = [
     "ImaginationConfig",
     "Learner",
     "Method",
+    "ModelFreeConfig",
     "Prediction",
     "SACConfig",
     "SVGDConfig",
@@ -44,6 +48,7 @@ __all__ = [
     "Transition",
     "get_method",
     "make_amortized_svgd",
+    "make_ddqn",
     "make_explorer",
     "make_generator",
     "make_generator_belief",

@@ -5,15 +5,14 @@ Haarnoja et al. (2018), arXiv 1801.01290, with the settings that Ratzlaff et al.
 Pure functions; the caller normalises observations.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
 
+from jaxplore.learner import Learner
 from jaxplore.networks import (
     ACTIVATIONS,
     INITIALIZERS,
@@ -84,23 +83,6 @@ class SACState:
     target_v: Params
     """Slow copy of the value network."""
     opt_state: optax.OptState
-
-
-class Learner(NamedTuple):
-    """A learner of behaviour as pure functions."""
-
-    init: Callable[[Key], SACState]
-    """`init(key) -> state`."""
-    actor: Callable[[SACState], Params]
-    """`actor(state) -> actor`: the part of the state that acting needs."""
-    act: Callable[[Key, Params, Array], Array]
-    """`act(key, actor, obs [..., O]) -> action [..., A]`, drawn from the policy."""
-    act_greedily: Callable[[Params, Array], Array]
-    """`act_greedily(actor, obs [..., O]) -> action [..., A]`, the squashed mean."""
-    update: Callable[[Key, SACState, Transition], tuple[SACState, Metrics]]
-    """`update(key, state, batch [B, ...]) -> (state, metrics)`, one gradient step of every network."""
-    batch_size: int
-    """Transitions that an update expects, `B`."""
 
 
 def make_sac(obs_size: int, action_size: int, config: SACConfig | None = None) -> Learner:
