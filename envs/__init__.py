@@ -6,11 +6,16 @@ from typing import Any
 
 from envs.ant_maze import make_ant_maze
 from envs.base import Coverage, Environment, EnvSpec, EnvState, FloorPlan
+from envs.half_cheetah import make_half_cheetah, make_half_cheetah_task
+from envs.hand_block import make_hand_block
 from envs.nchain import make_nchain
 from jaxplore import validate
 
 FACTORIES: dict[str, Callable[..., Environment]] = {
     "ant_maze": make_ant_maze,
+    "half_cheetah": make_half_cheetah,
+    "half_cheetah_task": make_half_cheetah_task,
+    "hand_block": make_hand_block,
     "nchain": make_nchain,
 }
 """Name of an environment, and what makes it. A new environment is one line here."""
