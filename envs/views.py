@@ -51,12 +51,15 @@ def make_sketch_view(limits: tuple[float, float, float, float], draw: Callable[[
         figure = Figure(figsize=(width / SKETCH_DPI, height / SKETCH_DPI), dpi=SKETCH_DPI)
         canvas = FigureCanvasAgg(figure)
         axes = figure.add_axes((0, 0, 1, 1))
+        x_min, x_max, y_min, y_max = limits
+        # Not matplotlib's own equal aspect: it may cut one axis instead of widening the other.
+        pixel = max((x_max - x_min) / width, (y_max - y_min) / height)
+        x_centre, y_centre = (x_min + x_max) / 2, (y_min + y_max) / 2
         for state in states:
             axes.clear()
             axes.set_axis_off()
-            x_min, x_max, y_min, y_max = limits
-            axes.set(xlim=(x_min, x_max), ylim=(y_min, y_max))
-            axes.set_aspect("equal", adjustable="datalim")
+            axes.set_xlim(x_centre - pixel * width / 2, x_centre + pixel * width / 2)
+            axes.set_ylim(y_centre - pixel * height / 2, y_centre + pixel * height / 2)
             # Keys are no NumPy arrays, and no picture needs one.
             draw(axes, jax.device_get(state.replace(key=())))
             canvas.draw()

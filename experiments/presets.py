@@ -50,6 +50,13 @@ DEFAULTS: dict[str, dict[str, Any]] = {
 ENVIRONMENTS: dict[str, dict[str, dict[str, Any]]] = {
     # Observation noise in nnaisense/max's commands, raw units; the paper is silent.
     "ant_maze": {"paper": {"obs_noise": 0.02}},
+    "half_cheetah": {"paper": {"obs_noise": 0.02}},
+    # The paper's scores are hundreds of steps: with 256 random steps at the start many runs would end among them.
+    "acrobot": {
+        "laptop": {"explorer": dataclasses.replace(LAPTOP, warm_up_steps=50)},
+        "paper": {"explorer": ExplorationConfig(warm_up_steps=50)},
+        "smoke": {"explorer": dataclasses.replace(SMOKE, warm_up_steps=50)},
+    },
 }
 """Environment -> preset -> the fields in which it departs from the defaults. A new environment adds its own."""
 
