@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxplore import dynamics, imagination, normalizer, replay
+from jaxplore import imagination, normalizer, replay
 from jaxplore.beliefs import Belief
 from jaxplore.dynamics import Normalizers
 from jaxplore.imagination import Mover, Reward
@@ -139,6 +139,7 @@ def make_imagination(
     predict = belief.predict
     if predict is None:
         raise ValueError("belief predicts nothing, so nothing can be imagined. Allowed: a belief with `predict`.")
+    encoding = belief.encoding
     flag = jnp.zeros((), bool)
     example = Transition(jnp.zeros(obs_size), jnp.zeros(action_size), jnp.zeros(()), jnp.zeros(obs_size), flag, flag)
 
@@ -159,8 +160,8 @@ def make_imagination(
         def chunk(i: Array, rewards: Array) -> Array:
             index = jnp.minimum(i * LABEL_CHUNK + jnp.arange(LABEL_CHUNK), capacity - 1)
             rows = jax.tree.map(lambda leaf: leaf[index], data.rows)
-            prediction = predict(experience.models, dynamics.model_inputs(normalizers, rows.obs, rows.action))
-            delta = dynamics.model_targets(normalizers, rows.obs, rows.next_obs)
+            prediction = predict(experience.models, encoding.inputs(normalizers, rows.obs, rows.action))
+            delta = encoding.targets(normalizers, rows.obs, rows.next_obs)
             return rewards.at[index].set(reward(prediction, delta, normalizers))
 
         num_chunks = (jnp.minimum(experience.num_data, capacity) + LABEL_CHUNK - 1) // LABEL_CHUNK
@@ -257,6 +258,7 @@ def make_imagination(
                 config.horizon,
                 config.mover,
                 config.bound,
+                encoding,
             )
             rows = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), rows)
             finite = jnp.isfinite(rows.reward) & jnp.all(jnp.isfinite(rows.next_obs), axis=-1)

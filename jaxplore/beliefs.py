@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import optax
 
 from jaxplore import dynamics, networks, replay
-from jaxplore.dynamics import DynamicsConfig, Normalizers, Prediction
+from jaxplore.dynamics import DELTA, ENCODINGS, DynamicsConfig, Encoding, Normalizers, Prediction
 from jaxplore.generator import GeneratorConfig, make_generator
 from jaxplore.replay import Replay
 from jaxplore.svgd import SVGDConfig, SVGDState, make_amortized_svgd
@@ -81,6 +81,8 @@ class Belief(NamedTuple):
     """`sample(key, state, num) -> models`: a tree whose leaves have a leading axis `M = num`."""
     predict: Callable[[Any, Array], Prediction] | None
     """`predict(models, inputs [N, O + A]) -> Prediction` of `[M, N, O]`. None: this belief predicts nothing."""
+    encoding: Encoding = DELTA
+    """What `inputs` and predictions are."""
 
 
 def make_generator_belief(
@@ -114,13 +116,15 @@ def make_generator_belief(
     """
     fit_config = fit_config or FitConfig()
     svgd_config = svgd_config or SVGDConfig()
-    network = dynamics.make_network(dynamics_config or DynamicsConfig(), obs_size)
+    dynamics_config = dynamics_config or DynamicsConfig()
+    encoding = ENCODINGS[dynamics_config.target]
+    network = dynamics.make_network(dynamics_config, obs_size)
     # Only the example's shapes and spread are used; a fixed key keeps the factory pure.
     example = network.init(jax.random.key(0), jnp.zeros(obs_size + action_size))["params"]
     generator = make_generator(example, generator_config)
 
     def apply(params: Any, inputs: Array) -> Array:
-        return networks.apply(network, params, inputs)
+        return encoding.outputs(networks.apply(network, params, inputs))
 
     posterior = make_amortized_svgd(generator, apply, obs_size, make_optimizer(fit_config), svgd_config)
 
@@ -129,12 +133,12 @@ def make_generator_belief(
     ) -> tuple[SVGDState, Metrics]:
         batch_key, extra_key, update_key = jax.random.split(key, 3)
         batch = replay.sample(batch_key, data, fit_config.batch_size)
-        inputs = dynamics.model_inputs(normalizers, batch.obs, batch.action)
-        targets = dynamics.model_targets(normalizers, batch.obs, batch.next_obs)
+        inputs = encoding.inputs(normalizers, batch.obs, batch.action)
+        targets = encoding.targets(normalizers, batch.obs, batch.next_obs)
         extra_inputs = None
         if svgd_config.repulsion_points == "independent":
             extra = replay.sample(extra_key, data, fit_config.batch_size)
-            extra_inputs = dynamics.model_inputs(normalizers, extra.obs, extra.action)
+            extra_inputs = encoding.inputs(normalizers, extra.obs, extra.action)
         num_data = jnp.maximum(data.size, 1)
         return posterior.update(update_key, state, inputs, targets, num_data, extra_inputs)
 
@@ -146,7 +150,7 @@ def make_generator_belief(
     def predict(models: Any, inputs: Array) -> Prediction:
         return Prediction(jax.vmap(apply, in_axes=(0, None))(models, inputs))
 
-    return Belief(posterior.init, update, sample, predict)
+    return Belief(posterior.init, update, sample, predict, encoding)
 
 
 def make_no_belief() -> Belief:

@@ -3,11 +3,16 @@
 A network sees the observation and the action, each entry in standard deviations from its mean, and predicts the
 *change* of the observation in standard deviations of that change ("normalised delta"). Losses, variances and
 intrinsic rewards are in these units unless something says otherwise.
+
+Where observations are one of finitely many states, a network may see them as they are and predict the probability of
+each state instead. Which of the two it is, is an `Encoding`.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple, TypeAlias, get_args
 
+import jax
 import jax.numpy as jnp
 from flax import struct
 
@@ -17,24 +22,30 @@ from jaxplore.normalizer import Normalizer
 from jaxplore.types import Array, Transition
 from jaxplore.validate import Checks
 
+Target: TypeAlias = Literal["delta", "one_hot"]
+
 
 @dataclass(frozen=True)
 class DynamicsConfig:
-    """Shape of one dynamics network."""
+    """Shape of one dynamics network, and what it predicts."""
 
     hidden: tuple[int, ...] = (512, 512, 512, 512)
     """Widths of the hidden layers. Paper: 4 x 512."""
     activation: str = "relu"
     """Paper: ReLU for all methods but MAX, which has swish."""
+    target: Target = "delta"
+    """`delta`: the normalised change of the observation. `one_hot`: the probability of each next state, for one-hot
+    observations; paper: the chain."""
 
     def __post_init__(self) -> None:
         checks = Checks(self)
+        checks.one_of("target", get_args(Target))
         checks.widths("hidden")
         checks.one_of("activation", ACTIVATIONS)
 
 
 class Prediction(NamedTuple):
-    """What m networks say of the same transitions, in normalised-delta units."""
+    """What m networks say of the same transitions: normalised deltas, or probabilities of each next state."""
 
     mean: Array
     """`[M, N, O]`"""
@@ -97,3 +108,35 @@ def model_targets(state: Normalizers, obs: Array, next_obs: Array) -> Array:
 def apply_delta(state: Normalizers, obs: Array, delta: Array) -> Array:
     """The next observation `[..., O]`, in raw units, that a normalised delta leads to."""
     return obs + normalizer.denormalize(state.delta, delta)
+
+
+class Encoding(NamedTuple):
+    """How a transition is written for a network, and how what the network says is read."""
+
+    inputs: Callable[[Normalizers, Array, Array], Array]
+    """`inputs(normalizers, obs [..., O], action [..., A]) -> [..., O + A]`: what a network sees."""
+    targets: Callable[[Normalizers, Array, Array], Array]
+    """`targets(normalizers, obs [..., O], next_obs [..., O]) -> [..., O]`: what it should say."""
+    outputs: Callable[[Array], Array]
+    """`outputs(last layer [..., O]) -> [..., O]`: what it says. Losses, variances and kernels see this."""
+    next_obs: Callable[[Normalizers, Array, Array], Array]
+    """`next_obs(normalizers, obs [..., O], outputs [..., O]) -> [..., O]`: where that leads, as an observation."""
+
+
+def _most_likely(normalizers: Normalizers, obs: Array, outputs: Array) -> Array:
+    return jax.nn.one_hot(jnp.argmax(outputs, axis=-1), outputs.shape[-1])
+
+
+DELTA = Encoding(model_inputs, model_targets, lambda last: last, apply_delta)
+"""Everything normalised; the network predicts the change of the observation."""
+
+ONE_HOT = Encoding(
+    inputs=lambda normalizers, obs, action: jnp.concatenate([obs, action], axis=-1),
+    targets=lambda normalizers, obs, next_obs: next_obs,
+    outputs=jax.nn.softmax,
+    next_obs=_most_likely,
+)
+"""Nothing normalised; the network predicts the probability of each next state, and the most likely one comes."""
+
+ENCODINGS: dict[str, Encoding] = {"delta": DELTA, "one_hot": ONE_HOT}
+"""`DynamicsConfig.target` -> encoding."""

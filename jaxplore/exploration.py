@@ -51,7 +51,8 @@ class Explorer(NamedTuple):
     assess: Callable[[Key, ExplorerState, Transition, Array], Metrics]
     """`assess(key, state, transitions [T, ...], valid [T]) -> metrics`: what the belief makes of transitions it has
     not seen. `intrinsic_reward` and `intrinsic_reward_p95` in the reward's units, `model_error` (mean squared error of
-    the models' mean, per normalised-delta entry; 1 is as good as predicting the mean change)."""
+    the models' mean, per normalised-delta entry, where 1 is as good as predicting the mean change; or per
+    probability)."""
 
 
 def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Explorer:
@@ -65,6 +66,10 @@ def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Ex
     Returns:
         An `Explorer`.
 
+    Raises:
+        ValueError: `dynamics.target="one_hot"` where observations are not one-hot, or what a part of the method
+            refuses.
+
     Example:
         >>> import jax, jax.numpy as jnp
         >>> from jaxplore.methods import METHODS
@@ -73,6 +78,11 @@ def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Ex
         >>> explorer.act(jax.random.key(1), explorer.actor(state), jnp.zeros(3)).shape
         (1,)
     """
+    if config.dynamics.target == "one_hot" and not sizes.one_hot_obs:
+        raise ValueError(
+            "DynamicsConfig.target='one_hot' predicts which of finitely many states comes next, and this environment's "
+            "observations are not one-hot. Allowed: 'delta'."
+        )
     belief = method.belief(sizes, config)
     reward = method.reward(config)
     behaviour = method.behaviour(sizes, config, belief, reward)
@@ -131,8 +141,8 @@ def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Ex
         if belief.predict is None:
             return {}
         models = belief.sample(key, state.belief, config.imagination.num_models)
-        inputs = dynamics.model_inputs(state.normalizers, transitions.obs, transitions.action)
-        delta = dynamics.model_targets(state.normalizers, transitions.obs, transitions.next_obs)
+        inputs = belief.encoding.inputs(state.normalizers, transitions.obs, transitions.action)
+        delta = belief.encoding.targets(state.normalizers, transitions.obs, transitions.next_obs)
         prediction = belief.predict(models, inputs)
         rewards = jnp.where(valid, reward(prediction, delta, state.normalizers), jnp.nan)
         errors = jnp.mean((jnp.mean(prediction.mean, axis=0) - delta) ** 2, axis=-1)

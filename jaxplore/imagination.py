@@ -6,8 +6,8 @@ from typing import Any, Literal, TypeAlias
 import jax
 import jax.numpy as jnp
 
-from jaxplore import dynamics, normalizer
-from jaxplore.dynamics import Normalizers, Prediction
+from jaxplore import normalizer
+from jaxplore.dynamics import DELTA, Encoding, Normalizers, Prediction
 from jaxplore.types import Array, Key, Transition
 
 Mover: TypeAlias = Literal["per_step", "per_rollout", "mean"]
@@ -29,6 +29,7 @@ def rollout(
     horizon: int,
     mover: Mover = "per_step",
     bound: float = 0.0,
+    encoding: Encoding = DELTA,
 ) -> Transition:
     """Imagine what a policy would meet.
 
@@ -47,13 +48,14 @@ def rollout(
         mover: which model moves an actor.
         bound: imagined observations stay within this many standard deviations of the real data's mean, and changes
             within as many of theirs: errors of a model feed on themselves. 0: no bound.
+        encoding: what the models see and say.
 
     Returns:
         Transitions `[H, N, ...]` with the intrinsic reward.
 
     Example:
         >>> import jax, jax.numpy as jnp
-        >>> from jaxplore import beliefs, rewards
+        >>> from jaxplore import beliefs, dynamics, rewards
         >>> belief = beliefs.make_generator_belief(2, 1, dynamics.DynamicsConfig(hidden=(8,)))
         >>> models = belief.sample(jax.random.key(0), belief.init(jax.random.key(1)), 4)
         >>> imagined = rollout(
@@ -70,7 +72,7 @@ def rollout(
     def step(obs: Array, step_key: Key) -> tuple[Array, Transition]:
         act_key, mover_key = jax.random.split(step_key)
         action = act(act_key, obs)
-        prediction = predict(models, dynamics.model_inputs(normalizers, obs, action))
+        prediction = predict(models, encoding.inputs(normalizers, obs, action))
         num_models = prediction.mean.shape[0]
         if mover == "mean":
             delta = jnp.mean(prediction.mean, axis=0)
@@ -79,7 +81,7 @@ def rollout(
             delta = prediction.mean[chosen, jnp.arange(num_actors)]
         if bound:
             delta = jnp.clip(delta, -bound, bound)
-        next_obs = dynamics.apply_delta(normalizers, obs, delta)
+        next_obs = encoding.next_obs(normalizers, obs, delta)
         if bound:
             seen = normalizer.normalize(normalizers.obs, next_obs)
             next_obs = normalizer.denormalize(normalizers.obs, jnp.clip(seen, -bound, bound))

@@ -8,18 +8,20 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, get_args
 
-from jaxplore import behaviours, beliefs, rewards, validate
+from jaxplore import behaviours, beliefs, planning, rewards, validate
 from jaxplore.behaviours import Behaviour, ImaginationConfig, ModelFreeConfig
 from jaxplore.beliefs import Belief, FitConfig
 from jaxplore.ddqn import DDQNConfig, make_ddqn
 from jaxplore.dynamics import DynamicsConfig
 from jaxplore.generator import GeneratorConfig
 from jaxplore.imagination import Reward
+from jaxplore.mcts import MCTSConfig
 from jaxplore.sac import SACConfig, make_sac
 from jaxplore.svgd import SVGDConfig
 from jaxplore.validate import Checks
 
 RewardUnits = Literal["normalized", "raw"]
+Planner = Literal["sac", "mcts"]
 
 
 @dataclass(frozen=True)
@@ -34,12 +36,16 @@ class ExplorationConfig:
     """Real transitions kept. nnaisense/max: the number of steps, plus one."""
     reward_units: RewardUnits = "normalized"
     """Units of the variance reward: normalised delta, or the observation's own (`raw`)."""
+    planner: Planner = "sac"
+    """How models and reward become behaviour: `sac`, trained in imagination, or `mcts`, tree search at each real step,
+    for one-hot observations and discrete actions. Paper: `mcts` for the chain."""
     dynamics: DynamicsConfig = field(default_factory=DynamicsConfig)
     generator: GeneratorConfig = field(default_factory=GeneratorConfig)
     svgd: SVGDConfig = field(default_factory=SVGDConfig)
     fit: FitConfig = field(default_factory=FitConfig)
     imagination: ImaginationConfig = field(default_factory=ImaginationConfig)
     sac: SACConfig = field(default_factory=SACConfig)
+    mcts: MCTSConfig = field(default_factory=MCTSConfig)
     model_free: ModelFreeConfig = field(default_factory=ModelFreeConfig)
     ddqn: DDQNConfig = field(default_factory=DDQNConfig)
 
@@ -49,6 +55,12 @@ class ExplorationConfig:
             checks.at_least(name, 1)
         checks.at_least("data_capacity", self.steps_per_round)
         checks.one_of("reward_units", get_args(RewardUnits))
+        checks.one_of("planner", get_args(Planner))
+        if self.reward_units == "raw" and self.dynamics.target == "one_hot":
+            raise ValueError(
+                "reward_units='raw' does not fit dynamics.target='one_hot', whose predictions are probabilities. "
+                "Allowed: 'normalized'."
+            )
 
 
 class Sizes(NamedTuple):
@@ -98,9 +110,37 @@ def no_reward(config: ExplorationConfig) -> Reward:
 
 
 def sac_in_imagination(sizes: Sizes, config: ExplorationConfig, belief: Belief, reward: Reward) -> Behaviour:
-    """SAC, trained in rollouts that the belief's models imagine."""
+    """SAC, trained in rollouts that the belief's models imagine. Refuses discrete actions."""
+    if sizes.discrete:
+        raise ValueError(
+            f"planner='sac' acts by numbers in [-1, 1]; here an action is one of {sizes.action} choices. "
+            "Allowed: planner='mcts' where observations are one-hot, or a method without SAC, such as random."
+        )
     sac = make_sac(sizes.obs, sizes.action, config.sac)
     return behaviours.make_imagination(belief, reward, sac, sizes.obs, sizes.action, config.imagination)
+
+
+def tree_search(sizes: Sizes, config: ExplorationConfig, belief: Belief, reward: Reward) -> Behaviour:
+    """Tree search in the belief's models at each real step. Refuses all but finitely many states and actions."""
+    if not (sizes.discrete and sizes.one_hot_obs):
+        raise ValueError(
+            "planner='mcts' searches finitely many states and actions; here actions are numbers or observations are "
+            "not one-hot. Allowed: planner='sac' where actions are numbers."
+        )
+    num_models = config.imagination.num_models
+    return planning.make_tree_search(belief, reward, sizes.obs, sizes.action, num_models, config.mcts)
+
+
+PLANNERS: dict[str, Callable[[Sizes, ExplorationConfig, Belief, Reward], Behaviour]] = {
+    "sac": sac_in_imagination,
+    "mcts": tree_search,
+}
+"""`ExplorationConfig.planner` -> behaviour."""
+
+
+def planned(sizes: Sizes, config: ExplorationConfig, belief: Belief, reward: Reward) -> Behaviour:
+    """The behaviour that the configuration names, for methods that plan in their models."""
+    return PLANNERS[config.planner](sizes, config, belief, reward)
 
 
 def uniform_actions(sizes: Sizes, config: ExplorationConfig, belief: Belief, reward: Reward) -> Behaviour:
@@ -125,10 +165,10 @@ def ddqn_on_task_reward(sizes: Sizes, config: ExplorationConfig, belief: Belief,
 
 METHODS: dict[str, Method] = {
     "implicit": Method(
-        "generator of models trained by amortised SVGD, variance reward, SAC in imagination",
+        "generator of models trained by amortised SVGD, variance reward, SAC in imagination or tree search",
         generator_belief,
         variance_reward,
-        sac_in_imagination,
+        planned,
     ),
     "ddqn": Method(
         "double DQN with epsilon-greedy actions on the environment's own reward, for discrete actions",
