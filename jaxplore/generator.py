@@ -8,7 +8,7 @@ posterior can be put over any network.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -107,27 +107,30 @@ def make_generator(example: Params, config: GeneratorConfig | None = None) -> Ge
     for index, (path, _) in enumerate(paths_and_leaves):
         layers.setdefault(jax.tree_util.keystr(path[:-1], simple=True, separator="/") or "root", []).append(index)
     leaves = [leaf for _, leaf in paths_and_leaves]
-    sizes = {name: sum(leaves[i].size for i in indices) for name, indices in layers.items()}
-    networks = {name: MLP(config.hidden, size, "relu", "he") for name, size in sizes.items()}
-    centre, std = {}, {}
-    for name, indices in layers.items():
-        centre[name], std[name] = _targets([(paths_and_leaves[i][0], leaves[i]) for i in indices], config)
+    features = MLP(config.hidden[:-1], config.hidden[-1], "relu", "he", "he")
+    targets = [_targets(path, leaf, config) for path, leaf in paths_and_leaves]
+
+    def head(key: Key, centre: np.ndarray, std: float) -> Array:
+        """What maps a layer's features to one leaf, `[size, width + 1]`: a row for each number of the leaf.
+
+        The bias is the last column, that of a feature which is always 1: its gradient is then part of one matrix
+        product. A leaf has its own so that nothing is cut up and put together again.
+        """
+        kernel_key, bias_key = jax.random.split(key)
+        # With He's initialisation the features entering the last layer have mean square 1, so their sum over `width`
+        # entries of variance v / width has variance v.
+        width, size = config.hidden[-1], centre.size
+        kernel_std = std * math.sqrt((1.0 - config.constant_fraction) / width)
+        kernel = kernel_std * jax.random.normal(kernel_key, (size, width))
+        constant = std * math.sqrt(config.constant_fraction) * jax.random.normal(bias_key, (size,))
+        return jnp.concatenate([kernel, (centre + constant)[:, None]], axis=1)
 
     def init(key: Key) -> Params:
         eta = {}
-        for name, layer_key in zip(networks, jax.random.split(key, len(networks)), strict=True):
-            hidden_key, kernel_key, bias_key = jax.random.split(layer_key, 3)
-            params = networks[name].init(hidden_key, jnp.zeros(config.noise_size))["params"]
-            # With He's initialisation the features entering the last layer have mean square 1, so their sum over
-            # `width` entries of variance v / width has variance v.
-            width, size = config.hidden[-1], sizes[name]
-            kernel_scale = math.sqrt((1.0 - config.constant_fraction) / width)
-            constant = math.sqrt(config.constant_fraction) * jax.random.normal(bias_key, (size,))
-            params["output"] = {
-                "kernel": kernel_scale * std[name][None, :] * jax.random.normal(kernel_key, (width, size)),
-                "bias": centre[name] + std[name] * constant,
-            }
-            eta[name] = params
+        for name, layer_key in zip(layers, jax.random.split(key, len(layers)), strict=True):
+            features_key, *keys = jax.random.split(layer_key, 1 + len(layers[name]))
+            heads = {str(i): head(key, *targets[i]) for i, key in zip(layers[name], keys, strict=True)}
+            eta[name] = {"features": features.init(features_key, jnp.zeros(config.noise_size))["params"], **heads}
         return eta
 
     def sample_noise(key: Key, num: int) -> Array:
@@ -137,31 +140,23 @@ def make_generator(example: Params, config: GeneratorConfig | None = None) -> Ge
     def generate(eta: Params, z: Array) -> Params:
         generated: list[Array | None] = [None] * len(leaves)
         for number, (name, indices) in enumerate(layers.items()):
-            flat = apply(networks[name], eta[name], z if config.noise == "shared" else z[number])
-            offset = 0
+            own_z = z if config.noise == "shared" else z[number]
+            inputs = jnp.append(jax.nn.relu(apply(features, eta[name]["features"], own_z)), 1.0)
             for i in indices:
-                generated[i] = flat[offset : offset + leaves[i].size].reshape(leaves[i].shape)
-                offset += leaves[i].size
+                generated[i] = (inputs @ eta[name][str(i)].T).reshape(leaves[i].shape)
         return jax.tree.unflatten(treedef, generated)
 
     return Generator(init, sample_noise, generate, jax.vmap(generate, in_axes=(None, 0)))
 
 
-def _targets(layer: list, config: GeneratorConfig) -> tuple[Array, Array]:
-    """Mean and standard deviation that each generated number of a layer starts with, over networks and inits."""
-    centres, stds = [], []
-    for path, leaf in layer:
-        if leaf.ndim < 2:
-            centres.append(np.ravel(np.asarray(leaf)))
-            stds.append(np.full(leaf.size, config.bias_std))
-            continue
-        std = kernel_std(leaf, config.init_std)
-        if std == 0.0:
-            name = jax.tree_util.keystr(path)
-            raise ValueError(
-                f"example{name} is all zeros, so its spread cannot be matched. "
-                "Allowed: an initialised network, or init_std='he' or 'lecun'."
-            )
-        centres.append(np.zeros(leaf.size))
-        stds.append(np.full(leaf.size, std))
-    return jnp.asarray(np.concatenate(centres), jnp.float32), jnp.asarray(np.concatenate(stds), jnp.float32)
+def _targets(path: Any, leaf: Array, config: GeneratorConfig) -> tuple[np.ndarray, float]:
+    """Means `[size]` and standard deviation that a leaf's numbers start with, over networks and initialisations."""
+    if leaf.ndim < 2:
+        return np.ravel(np.asarray(leaf, np.float32)), config.bias_std
+    std = kernel_std(leaf, config.init_std)
+    if std == 0.0:
+        raise ValueError(
+            f"example{jax.tree_util.keystr(path)} is all zeros, so its spread cannot be matched. "
+            "Allowed: an initialised network, or init_std='he' or 'lecun'."
+        )
+    return np.zeros(leaf.size, np.float32), std

@@ -334,11 +334,8 @@ def make_amortized_svgd(
         further = points(points_key, inputs, extra_inputs)
         all_inputs = inputs if further is None else jnp.concatenate([inputs, further])
 
-        def forward(eta: Params) -> tuple[Array, Params]:
-            thetas = generator.sample(eta, z)
-            return jax.vmap(apply, in_axes=(0, None))(thetas, all_inputs), thetas
-
-        (values, thetas), backward = jax.vjp(forward, state.eta)
+        thetas, to_eta = jax.vjp(lambda eta: generator.sample(eta, z), state.eta)
+        values, to_theta = jax.vjp(lambda thetas: jax.vmap(apply, in_axes=(0, None))(thetas, all_inputs), thetas)
         # Points that stand in for the batch (an independent batch), or join it.
         start = batch_size if config.repulsion_points == "independent" and repulsion_inputs is None else 0
         repulsion_values = values[:, start:]
@@ -356,13 +353,12 @@ def make_amortized_svgd(
             prior_scores = _gp_scores(repulsion_points, repulsion_values, config)
             repulsion = repulsion + jnp.einsum("ij,jro->iro", direction.weights, prior_scores)
         value_move = value_move.at[:, start:].add(repulsion)
-        if config.prior == "weights":
-            theta_move = _weight_prior_move(thetas, direction.weights, config)
-        else:
-            theta_move = jax.tree.map(jnp.zeros_like, thetas)
-
         scale = -temperature / (num * num_data)
-        (gradient,) = backward((scale * value_move, jax.tree.map(lambda move: scale * move, theta_move)))
+        (theta_gradient,) = to_theta(scale * value_move)
+        if config.prior == "weights":
+            move = _weight_prior_move(thetas, direction.weights, config)
+            theta_gradient = jax.tree.map(lambda gradient, move: gradient + scale * move, theta_gradient, move)
+        (gradient,) = to_eta(theta_gradient)
         steps, opt_state = optimizer.update(gradient, state.opt_state, state.eta)
         likelihood_var = state.likelihood_var
         if config.learn_likelihood_std:

@@ -91,7 +91,7 @@ def test_sampled_tree_is_the_examples_tree(nested):
     thetas = generator.sample(eta, generator.sample_noise(jax.random.key(2), 4))
     assert jax.tree.map(lambda a: ((4, *a.shape), a.dtype), tree) == jax.tree.map(lambda a: (a.shape, a.dtype), thetas)
     assert sorted(eta) == ["Conv_0", "LayerNorm_0", "inner/hidden_0", "inner/output", "root"]
-    assert sum(p["output"]["bias"].size for p in eta.values()) == count_params(tree)
+    assert sum(len(head) for p in eta.values() for name, head in p.items() if name != "features") == count_params(tree)
     outputs = jax.vmap(lambda theta: Nested().apply({"params": theta}, jnp.ones(6)))(thetas)
     assert outputs.shape == (4, 2)
 
@@ -118,7 +118,7 @@ def test_layers_share_their_noise_or_not(noise, linked):
     tree = {"a": {"kernel": jnp.ones((4, 10))}, "b": {"kernel": jnp.ones((3, 3))}}
     generator = make_generator(tree, GeneratorConfig(noise_size=2, hidden=(16,), noise=noise))
     eta = generator.init(jax.random.key(0))
-    eta["b"]["hidden_0"] = eta["a"]["hidden_0"]
+    eta["b"]["features"] = eta["a"]["features"]
     thetas = generator.sample(eta, generator.sample_noise(jax.random.key(1), 2000))
     a, b = (np.asarray(thetas[n]["kernel"]).reshape(2000, -1) for n in "ab")
     a, b = a - a.mean(axis=0), b - b.mean(axis=0)
@@ -128,14 +128,15 @@ def test_layers_share_their_noise_or_not(noise, linked):
 
 
 def test_layer_order_and_offsets():
-    # each number of theta is one output of its layer's MLP, leaves in the tree's order: with zero kernels, its biases
+    # each number of theta is one row of its leaf's head, in the leaf's order: with zero kernels, the row's last entry
     tree = {"layer": {"kernel": jnp.ones((2, 3)), "bias": jnp.zeros(3)}}
     generator = make_generator(tree, GeneratorConfig(hidden=(4,)))
     eta = jax.tree.map(jnp.zeros_like, generator.init(jax.random.key(0)))
-    eta["layer"]["output"]["bias"] = jnp.arange(9.0)
+    for leaf in ("0", "1"):
+        eta["layer"][leaf] = eta["layer"][leaf].at[:, -1].set(10.0 * int(leaf) + jnp.arange(len(eta["layer"][leaf])))
     theta = generator.generate(eta, jnp.ones(32))["layer"]
     np.testing.assert_array_equal(theta["bias"], [0, 1, 2])
-    np.testing.assert_array_equal(theta["kernel"], [[3, 4, 5], [6, 7, 8]])
+    np.testing.assert_array_equal(theta["kernel"], [[10, 11, 12], [13, 14, 15]])
 
 
 def test_sample_is_generate_for_each_z(nested):
