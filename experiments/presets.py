@@ -16,14 +16,14 @@ LAPTOP = ExplorationConfig(
     fit=FitConfig(lr=1e-3, weight_decay=0.0, batch_size=128, epochs=0, steps=60, restart=False),
     imagination=ImaginationConfig(
         horizon=25,
-        num_rollouts=1,
+        num_rollouts=4,
         num_random_rollouts=0,
-        updates_per_rollout=300,
+        updates_per_rollout=75,
         real_updates=0,
         current_fraction=0.5,
         mover="per_rollout",
         bound=10.0,
-        replay_capacity=9_600,
+        replay_capacity=25_600,
         restart_every=12,
         normalize_reward=True,
     ),
@@ -35,7 +35,9 @@ SMOKE = dataclasses.replace(
     LAPTOP,
     dynamics=DynamicsConfig(hidden=(32, 32)),
     fit=dataclasses.replace(LAPTOP.fit, steps=10),
-    imagination=dataclasses.replace(LAPTOP.imagination, horizon=10, num_actors=32, updates_per_rollout=20),
+    imagination=dataclasses.replace(
+        LAPTOP.imagination, horizon=10, num_actors=32, num_rollouts=1, updates_per_rollout=20
+    ),
     sac=dataclasses.replace(LAPTOP.sac, hidden=(32, 32), batch_size=64),
 )
 """The laptop's settings cut down until nothing can be learned: it shows that everything runs."""
