@@ -53,6 +53,8 @@ ENVIRONMENTS: dict[str, dict[str, dict[str, Any]]] = {
     # Observation noise in nnaisense/max's commands, raw units; the paper is silent.
     "ant_maze": {"paper": {"obs_noise": 0.02}},
     "half_cheetah": {"paper": {"obs_noise": 0.02}},
+    # Ten episodes.
+    "mountain_car": {"laptop": {"explorer": LAPTOP, "steps": 5_000}},
     # The paper's scores are hundreds of steps: with 256 random steps at the start many runs would end among them.
     "acrobot": {
         "laptop": {"explorer": dataclasses.replace(LAPTOP, warm_up_steps=50)},
