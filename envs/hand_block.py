@@ -14,7 +14,7 @@ The model is built from the files that the `gymnasium-robotics` package brings; 
 - contact of the hand with the floor, which it cannot reach within its joints' limits;
 - contact with the two 2 mm cubes that mark joints inside the thumb;
 - the forearm's mesh: the block meets a capsule of its size there. Everything else that can touch, touches as before:
-  block with palm, wrist, forearm, all fingers and floor, and fingers with fingers and palm (one pair was listed twice).
+  block with palm, wrist, forearm, all fingers and floor, and fingers with fingers and palm.
 """
 # pyright: reportAttributeAccessIssue=false
 # mujoco ships no stubs.
@@ -102,11 +102,6 @@ def make_model() -> mujoco.MjModel:
     for tendon in spec.tendons:
         if not tendon.name.endswith("J1c"):
             spec.delete(tendon)
-    pairs = set()
-    for pair in spec.pairs:
-        if (pair.geomname1, pair.geomname2) in pairs:
-            spec.delete(pair)
-        pairs.add((pair.geomname1, pair.geomname2))
     for name in ("robot0:V_thbase", "robot0:V_thhub"):
         spec.geom(name).contype = spec.geom(name).conaffinity = 0
     # A kind of contact of their own: the hand offers kind 1, which the floor no longer takes.
