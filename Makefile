@@ -35,10 +35,12 @@ check: $(INSTALLED)
 	@$(BIN)/ruff format --check .
 	@PYRIGHT_PYTHON_IGNORE_WARNINGS=1 PYRIGHT_PYTHON_GLOBAL_NODE=off $(BIN)/pyright
 
-# Every platform and every Python from 3.11 on in one file; the versions already there are kept where they can be.
+# Every platform, every Python from 3.11 on and every extra but playground, which is 400 MB, in one file; the versions
+# already there are kept where they can be.
 lock:
 	@test -x $(BIN)/uv || $(MAKE) $(INSTALLED)
-	@$(BIN)/uv pip compile pyproject.toml --all-extras --group dev --universal --python-version 3.11 --generate-hashes \
+	@$(BIN)/uv pip compile pyproject.toml --extra experiments --extra render --extra robotics \
+	  --group dev --universal --python-version 3.11 --generate-hashes \
 	  --no-emit-index-url --no-header --no-annotate --quiet --output-file requirements.lock $(ARGS)
 
 $(INSTALLED): requirements.lock pyproject.toml

@@ -1,9 +1,16 @@
-"""The environments, by name: `make("ant_maze", obs_noise=0.02)`. See `envs.base` for what an environment is."""
+"""The environments, by name: `make("ant_maze", obs_noise=0.02)`, `make("gymnasium:Pendulum-v1")`.
 
+See `envs.base` for what an environment is. Importing this package also registers the ones in `FACTORIES` with
+Gymnasium; see `envs.gymnasium_api`.
+"""
+
+import functools
+import importlib
 import inspect
 from collections.abc import Callable
 from typing import Any
 
+from envs import gymnasium_api
 from envs.acrobot import make_acrobot
 from envs.ant_maze import make_ant_maze
 from envs.base import Coverage, Environment, EnvSpec, EnvState, FloorPlan
@@ -25,22 +32,67 @@ FACTORIES: dict[str, Callable[..., Environment]] = {
 """Name of an environment, and what makes it. A new environment is one line here."""
 
 
+ADAPTERS = {
+    "brax": "envs.brax_adapter",
+    "gymnasium": "envs.gymnasium_adapter",
+    "playground": "envs.playground_adapter",
+}
+"""Prefix of the names of other packages' environments, and the module that adapts them, imported when it is asked for.
+It has `check_name(name)` and `make_environment(name, **options)`, `name` without the prefix."""
+
+
+def check_name(name: str) -> None:
+    """Raise unless there is an environment of this name: one of `FACTORIES`, or one of another package, such as
+    `gymnasium:Pendulum-v1`, `brax:hopper` or `playground:CartpoleBalance`.
+
+    Raises:
+        ValueError: an unknown name or prefix, with the nearest match and what is allowed; or the package is missing,
+            with what to install.
+    """
+    find_factory(name)
+
+
+def find_factory(name: str) -> Callable[..., Environment]:
+    """What makes the environment called `name`; its arguments are the options of `make`. Raises as `check_name`."""
+    prefix, colon, own_name = str(name).partition(":")
+    if not colon:
+        # A name with a colon in it, which this one is not, so it is never taken for known.
+        validate.one_of("env", name, [*FACTORIES, *(f"{prefix}:NAME" for prefix in ADAPTERS)])
+        return FACTORIES[name]
+    validate.one_of("the package before the colon in env", prefix, ADAPTERS)
+    adapter = importlib.import_module(ADAPTERS[prefix])
+    adapter.check_name(own_name)
+    return functools.partial(adapter.make_environment, own_name)
+
+
 def make(name: str, **options: Any) -> Environment:
     """The environment called `name`.
 
     Args:
-        name: one of `FACTORIES`.
+        name: one of `FACTORIES`, or one of another package as `check_name` describes.
         **options: the factory's own arguments, such as `backend` and `obs_noise`.
 
     Raises:
-        ValueError: an unknown name or option, with the nearest match and the list of those that are known; or an
-            option's value that the factory refuses.
+        ValueError: an unknown name or option, with the nearest match and the list of those that are known; a package
+            that is missing; or an option's value that the factory refuses.
     """
-    validate.one_of("env", name, FACTORIES)
-    factory = FACTORIES[name]
+    factory = find_factory(name)
     for option in options:
         validate.one_of(f"option of {name!r}", option, inspect.signature(factory).parameters)
     return factory(**options)
 
 
-__all__ = ["FACTORIES", "Coverage", "EnvSpec", "EnvState", "Environment", "FloorPlan", "make"]
+gymnasium_api.register(FACTORIES)
+
+__all__ = [
+    "ADAPTERS",
+    "FACTORIES",
+    "Coverage",
+    "EnvSpec",
+    "EnvState",
+    "Environment",
+    "FloorPlan",
+    "check_name",
+    "find_factory",
+    "make",
+]

@@ -12,7 +12,7 @@ No environment resets itself. `Transition.next_obs` is always the true successor
 import importlib
 import math
 import numbers
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -56,6 +56,8 @@ class EnvSpec:
     """False: action entries are numbers in [-1, 1]. True: an action is one of `A` choices, as a one-hot `[A]`."""
     one_hot_obs: bool = False
     """Whether an observation is one of `O` states, as a one-hot vector `[O]`."""
+    obs_limits: tuple[tuple[float, float], ...] | None = None
+    """Lowest and highest value of each observation entry, infinite where there is none; None: not known."""
 
     @property
     def obs_size(self) -> int:
@@ -94,8 +96,8 @@ class FloorPlan(NamedTuple):
 class View(NamedTuple):
     """How an environment is drawn; `envs.views` makes them."""
 
-    frames: Callable[[Sequence[EnvState], int, int, str], Iterator[np.ndarray]]
-    """`frames(states, height, width, camera)`: one uint8 `[height, width, 3]` per state."""
+    frames: Callable[[Iterable[EnvState], int, int, str], Iterator[np.ndarray]]
+    """`frames(states, height, width, camera)`: one uint8 `[height, width, 3]` per state, drawn as it is asked for."""
     cameras: tuple[str, ...]
     """Where it can be looked at from; the first is the usual place."""
     needs_renderer: bool
@@ -118,6 +120,11 @@ class Environment:
     """True: pure JAX. False: runs on the host, one environment a call."""
     floor_plan: FloorPlan | None = None
     view: View | None = None
+    reset_all: Callable[[Key], tuple[EnvState, ...]] | None = None
+    """On the host: `reset_all(keys [S]) -> states`, what `reset` gives for each key. None: one after the other."""
+    step_all: Callable[[tuple[EnvState, ...], np.ndarray], tuple[tuple[EnvState, ...], Transition]] | None = None
+    """On the host: `step_all(states, actions [S, A]) -> (states, transitions [S])`, what `step` gives for each state.
+    None: one after the other."""
 
 
 class Physics(NamedTuple):

@@ -14,13 +14,13 @@ on both axes (nnaisense/max, issue 3, the maintainer's answer: "# of visited blo
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs.base import Coverage
+from envs.base import Coverage, EnvSpec
 from jaxplore import validate
 from jaxplore.types import Array
 
@@ -112,6 +112,90 @@ def make_grid_coverage(
         return jnp.where(inside, index, -1)
 
     return Coverage(math.prod(counts), cell, unit, reachable)
+
+
+ENTRY_BINS = (50, 16, 8)
+"""Bins along each entry of a grid over one, two or three of them."""
+PROJECTION_BINS = 16
+PROJECTION_SEED = 0
+
+
+def make_entries_coverage(spec: EnvSpec, entries: Sequence[str] | Sequence[int]) -> Coverage:
+    """Cells over one to three entries of the observation that a user names, of any environment.
+
+    Each entry is brought to [-1, 1] and cut into equal bins, 50 for one entry, 16 x 16 for two, 8 x 8 x 8 for three. An
+    entry x with known limits low and high becomes `2 (x - low) / (high - low) - 1`, beyond them -1 or 1; any other one
+    becomes `2 / pi * arctan(x)`, so half of its bins lie between -1 and 1 in the entry's own unit. An observation with
+    an entry that is not finite lies in no cell.
+
+    Args:
+        spec: the environment's; its `obs_limits` are the known limits.
+        entries: indices of entries, from 0, or their names with or without the unit (`"x"` for `"x [m]"`).
+
+    Raises:
+        ValueError: no entry, more than three, one named twice, or one that there is not; with those that there are.
+    """
+    dims = tuple(_find_entry(spec, entry) for entry in entries)
+    if not 1 <= len(dims) <= len(ENTRY_BINS) or len(set(dims)) < len(dims):
+        raise ValueError(f"coverage_dims={tuple(entries)!r}. Allowed: 1 to {len(ENTRY_BINS)} entries, each once.")
+    bins, count = ENTRY_BINS[len(dims) - 1], len(dims)
+    grid = make_grid_coverage(range(count), (-1.0,) * count, (1.0,) * count, bins, "cells", clip=True)
+    squash = _make_squash(spec)
+    unit = f"cells of {', '.join(spec.obs_names[dim] for dim in dims)}"
+    return Coverage(grid.num_cells, lambda obs: grid.cell(squash(obs)[jnp.array(dims)]), unit)
+
+
+def make_generic_coverage(spec: EnvSpec) -> Coverage:
+    """Cells for an environment whose own are not known: 16 x 16 over a fixed random projection of the observation.
+
+    Each entry is brought to [-1, 1] as in `make_entries_coverage`. The two directions are orthogonal, of length 1,
+    and drawn once and for all from the number of entries: the same in every run. Projections are cut into 16 equal bins
+    over [-1, 1] each; beyond that they count as in the outermost bin. How many of the 256 cells can be reached is not
+    known, so coverage compares agents in one environment, not environments. With two entries or one nothing is
+    projected, and where observations are one-hot the states themselves are counted.
+    """
+    if spec.one_hot_obs:
+        return Coverage(spec.obs_size, lambda obs: jnp.argmax(obs).astype(jnp.int32), "states")
+    if spec.obs_size <= 2:
+        return make_entries_coverage(spec, range(spec.obs_size))
+    random = np.random.RandomState(PROJECTION_SEED).standard_normal((spec.obs_size, 2))
+    directions = np.linalg.qr(random)[0].T.astype(np.float32)
+    squash = _make_squash(spec)
+    grid = make_grid_coverage((0, 1), (-1.0, -1.0), (1.0, 1.0), PROJECTION_BINS, "cells", clip=True)
+    return Coverage(grid.num_cells, lambda obs: grid.cell(directions @ squash(obs)), "cells of a random projection")
+
+
+def _find_entry(spec: EnvSpec, entry: str | int) -> int:
+    """The index of an entry of the observation."""
+    if isinstance(entry, int) or entry.lstrip("-").isdecimal():
+        if not 0 <= int(entry) < spec.obs_size:
+            raise ValueError(
+                f"coverage_dims={entry!r} is out of range. Allowed: 0 to {spec.obs_size - 1}, or names: "
+                f"{', '.join(spec.obs_names)}."
+            )
+        return int(entry)
+    if entry in spec.obs_names:
+        return spec.obs_names.index(entry)
+    bare = [name.partition(" [")[0] for name in spec.obs_names]
+    validate.one_of("coverage_dims", entry, bare)
+    return bare.index(entry)
+
+
+def _make_squash(spec: EnvSpec) -> Callable[[Array], Array]:
+    """`squash(obs [O]) -> [O]`, each entry in [-1, 1]."""
+    low, high = np.array(spec.obs_limits or [(-np.inf, np.inf)] * spec.obs_size, np.float64).T
+    # Limits as wide as numbers go are none.
+    known = (low < high) & (np.maximum(np.abs(low), np.abs(high)) < 1e6)
+    low, high = np.where(known, low, -1.0), np.where(known, high, 1.0)
+    centre, half = ((low + high) / 2).astype(np.float32), ((high - low) / 2).astype(np.float32)
+
+    def squash(obs: Array) -> Array:
+        scaled = (obs - centre) / half
+        # Clipped before a value that is not finite could pass for the outermost; such a one stays what it is.
+        squashed = jnp.where(known, jnp.clip(scaled, -1.0, 1.0), 2 / jnp.pi * jnp.arctan(scaled))
+        return jnp.where(jnp.isfinite(obs), squashed, jnp.nan)
+
+    return squash
 
 
 def init(coverage: Coverage) -> Array:

@@ -2,7 +2,7 @@
 # pyright: reportAttributeAccessIssue=false
 # mujoco ships no stubs.
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import jax
@@ -11,6 +11,7 @@ import numpy as np
 from envs.base import EnvState, View
 
 SKETCH_DPI = 100
+FREE = "free"
 
 
 def make_mujoco_view(model: Any, qpos: Callable[[EnvState], Any], cameras: tuple[str, ...]) -> View:
@@ -19,10 +20,11 @@ def make_mujoco_view(model: Any, qpos: Callable[[EnvState], Any], cameras: tuple
     Args:
         model: a `mujoco.MjModel`.
         qpos: `qpos(state) -> [nq]`, the model's positions in a state.
-        cameras: names of the model's cameras, the usual one first.
+        cameras: names of the model's cameras, the usual one first. With none, `"free"`: one that sees all of the model.
     """
+    usual = cameras or (FREE,)
 
-    def frames(states: Sequence[EnvState], height: int, width: int, camera: str) -> Iterator[np.ndarray]:
+    def frames(states: Iterable[EnvState], height: int, width: int, camera: str) -> Iterator[np.ndarray]:
         import mujoco
 
         data = mujoco.MjData(model)
@@ -30,10 +32,10 @@ def make_mujoco_view(model: Any, qpos: Callable[[EnvState], Any], cameras: tuple
             for state in states:
                 data.qpos[:] = jax.device_get(qpos(state))
                 mujoco.mj_forward(model, data)
-                renderer.update_scene(data, camera=camera)
+                renderer.update_scene(data, camera=camera if cameras else -1)
                 yield renderer.render()
 
-    return View(frames, cameras, True)
+    return View(frames, usual, True)
 
 
 def make_sketch_view(limits: tuple[float, float, float, float], draw: Callable[[Any, EnvState], None]) -> View:
@@ -44,7 +46,7 @@ def make_sketch_view(limits: tuple[float, float, float, float], draw: Callable[[
         draw: `draw(axes, state)` draws one state, of NumPy arrays, onto matplotlib axes.
     """
 
-    def frames(states: Sequence[EnvState], height: int, width: int, camera: str) -> Iterator[np.ndarray]:
+    def frames(states: Iterable[EnvState], height: int, width: int, camera: str) -> Iterator[np.ndarray]:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
 

@@ -22,7 +22,7 @@ class RunConfig:
     """One run: an environment, a method, seeds, and every setting."""
 
     env: str = "ant_maze"
-    """Environment to explore."""
+    """Environment to explore: one of ours, or `gymnasium:ID`, `brax:NAME`, `playground:NAME`."""
     method: str = "implicit"
     """How: `implicit` (the paper's) or `random` (uniform actions)."""
     preset: Preset = "laptop"
@@ -40,11 +40,16 @@ class RunConfig:
     """Standard deviation of Gaussian noise on each observation, raw units."""
     checkpoint_every: int = 1_000
     """Steps between two checkpoints."""
+    coverage_dims: tuple[str, ...] = ()
+    """Count coverage over these one to three observation entries, by index or name (`0,1`), in place of the
+    environment's own cells."""
     explorer: ExplorationConfig = field(default_factory=ExplorationConfig)
 
     def __post_init__(self) -> None:
         checks = Checks(self)
-        validate.one_of("env", self.env, envs.FACTORIES)
+        entries = tuple(part.strip() for entry in self.coverage_dims for part in str(entry).split(","))
+        object.__setattr__(self, "coverage_dims", entries)
+        envs.check_name(self.env)
         validate.one_of("method", self.method, METHODS)
         validate.one_of("preset", self.preset, PRESETS)
         checks.at_least("seed", 0)
@@ -65,7 +70,7 @@ def preset_config(preset: str, env: str = "ant_maze") -> RunConfig:
         ValueError: unknown `preset` or `env`, naming the nearest match.
     """
     validate.one_of("preset", preset, PRESETS)
-    validate.one_of("env", env, envs.FACTORIES)
+    envs.check_name(env)
     return RunConfig(env=env, preset=cast(Preset, preset), **presets.settings(preset, env))
 
 

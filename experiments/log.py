@@ -223,7 +223,7 @@ class TensorBoardLog:
             raise disk_error("write TensorBoard events", self._directory, error, "go on with --resume") from error
 
 
-_EXPLORATION = {"coverage", "cells", "intrinsic", "imagined", "episodes", "episode", "reward"}
+_EXPLORATION = {"coverage", "cells", "intrinsic", "imagined", "episodes", "episode", "reward", "dropped"}
 
 
 def _tag(name: str) -> str:
@@ -374,6 +374,8 @@ def summary(
     text[1:1] = [rule]
     if len(seeds) > 1:
         text[-2:-2] = [rule]
+    if dropped := sum(row.get("dropped") or 0 for row in rows):
+        text += ["", f"{dropped:,} steps dropped: physics that diverged, which ends an episode and is no data"]
     if files:
         width = max(map(len, files))
         text += ["", *(f"{name.ljust(width)}   {os.fspath(path)}" for name, path in files.items())]

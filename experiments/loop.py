@@ -1,7 +1,7 @@
 """A run: environments step, the explorer learns, everything is logged; on one or several seeds side by side.
 
-The explorer is one jitted program over all seeds. Environments on the device are stepped by another; those on the
-host one seed after the other. All randomness follows from the seed and the step, so a run that is resumed is the run
+The explorer is one jitted program over all seeds. Environments on the device are stepped by another; for those on the
+host all seeds act in one. All randomness follows from the seed and the step, so a run that is resumed is the run
 that was never interrupted.
 """
 
@@ -20,7 +20,8 @@ from flax import struct
 import envs
 from envs import coverage
 from envs.base import Environment
-from envs.wrappers import Collect, make_collect
+from envs.wrappers import Collect, make_collect, make_collect_all, reset_all
+from envs.wrappers import CollectAll as HostCollect
 from experiments.checkpoint import Checkpoints
 from experiments.config import RunConfig
 from experiments.errors import RunError, disk_error
@@ -73,8 +74,11 @@ def make_environment(config: RunConfig) -> Environment:
     One that draws something of its own once and for all, such as the chain's flip-states, draws it from the run's first
     seed: seeds carried side by side share it.
     """
-    own = {"seed": config.seed} if "seed" in inspect.signature(envs.FACTORIES[config.env]).parameters else {}
-    return envs.make(config.env, backend=config.backend, obs_noise=config.obs_noise, **own)
+    own = {"seed": config.seed} if "seed" in inspect.signature(envs.find_factory(config.env)).parameters else {}
+    env = envs.make(config.env, backend=config.backend, obs_noise=config.obs_noise, **own)
+    if config.coverage_dims:
+        env = dataclasses.replace(env, coverage=coverage.make_entries_coverage(env.spec, config.coverage_dims))
+    return env
 
 
 def make_run_explorer(config: RunConfig, env: Environment) -> Explorer:
@@ -99,7 +103,7 @@ def make_programs(config: RunConfig, env: Environment, explorer: Explorer) -> Pr
 
     def init() -> RunState:
         reset_keys = keys(RESET, 0)
-        env_state = jax.jit(jax.vmap(env.reset))(reset_keys) if env.compiled else tuple(map(env.reset, reset_keys))
+        env_state = jax.jit(jax.vmap(env.reset))(reset_keys) if env.compiled else reset_all(env, reset_keys)
         steps = config.steps if env.floor_plan else 0
         return RunState(
             explorer=jax.jit(jax.vmap(explorer.init))(keys(INIT, 0)),
@@ -111,7 +115,10 @@ def make_programs(config: RunConfig, env: Environment, explorer: Explorer) -> Pr
 
     actors = jax.jit(jax.vmap(explorer.actor))
 
-    collect_all = (_collect_on_device if env.compiled else _collect_on_host)(make_collect(env, capacity), act)
+    if env.compiled:
+        collect_all = _collect_on_device(make_collect(env, capacity), act)
+    else:
+        collect_all = _collect_on_host(make_collect_all(env, capacity), act)
 
     def collect(state: RunState, step: int, num_steps: int, uniform: bool) -> tuple[Any, Transition, Array]:
         return collect_all(keys(COLLECT, step), state.env, actors(state.explorer), num_steps, uniform)
@@ -163,19 +170,22 @@ def _collect_on_device(collect: Collect, act: Callable[..., Array]) -> CollectAl
     return collect_all
 
 
-def _collect_on_host(collect: Collect, act: Callable[..., Array]) -> CollectAll:
-    """One seed after the other."""
-    act = jax.jit(act)
-    take = jax.jit(lambda tree, i: jax.tree.map(lambda leaf: leaf[i], tree))
+def _collect_on_host(collect: HostCollect, act: Callable[..., Array]) -> CollectAll:
+    """All seeds act in one program a step; the environments are stepped in Python."""
+
+    @jax.jit
+    def act_all(actors: Any, uniform: bool, keys: Key, obs: Array) -> tuple[Key, Array, Key]:
+        def one(args: tuple[Any, Key, Array]) -> tuple[Key, Array, Key]:
+            actor, key, obs = args
+            key, act_key, reset_key = jax.random.split(key, 3)
+            return key, act(act_key, actor, obs, uniform), reset_key
+
+        # Not vmap: a product of a batch of matrices rounds otherwise than that of one, and a seed's run beside others
+        # is to be its run alone.
+        return jax.lax.map(one, (actors, keys, obs))
 
     def collect_all(keys: Key, env_state: Any, actors: Any, num_steps: int, uniform: bool):
-        states, chunks = [], []
-        for i, state in enumerate(env_state):
-            own = take(actors, i)
-            state, *chunk = collect(keys[i], state, lambda k, obs, own=own: act(k, own, obs, uniform), num_steps)
-            states.append(state)
-            chunks.append(tuple(chunk))
-        return tuple(states), *jax.tree.map(lambda *leaves: np.stack(leaves), *chunks)
+        return collect(keys, env_state, lambda keys, obs: act_all(actors, uniform, keys, obs), num_steps)
 
     return collect_all
 
@@ -316,7 +326,8 @@ def _carry_on(
         _remember(env, programs, state, transitions, valid, episode_step, first, end)
         state = dataclasses.replace(state, explorer=learned, env=env_state)
         now = time.monotonic()
-        rows = _rows(config, state, told_metrics, end, now - began, (end - first) / (now - round_began))
+        dropped = end - first - valid.sum(axis=1)
+        rows = _rows(config, state, told_metrics, dropped, end, now - began, (end - first) / (now - round_began))
         metrics.append(rows)
         board.append(rows)
         progress.update(end, rows)
@@ -355,8 +366,10 @@ def _remember(
         episode_step = np.where(done[:, t], 0, episode_step + 1)
 
 
-def _rows(config: RunConfig, state: RunState, metrics: Metrics, step: int, wall_time: float, speed: float) -> list[Row]:
-    """The round's rows, one per seed."""
+def _rows(
+    config: RunConfig, state: RunState, metrics: Metrics, dropped: Array, step: int, wall_time: float, speed: float
+) -> list[Row]:
+    """The round's rows, one per seed; `dropped` `[S]` counts the steps whose physics diverged, which are no data."""
     rows = []
     for i in range(config.num_seeds):
         cells = int(np.sum(state.visited[i]))
@@ -366,6 +379,7 @@ def _rows(config: RunConfig, state: RunState, metrics: Metrics, step: int, wall_
                 "seed": config.seed + i,
                 "coverage": cells / state.visited.shape[1],
                 "cells": cells,
+                "dropped": int(dropped[i]),
                 **{name: values[i] for name, values in metrics.items()},
                 "wall_time": round(wall_time, 3),
                 "steps_per_second": round(speed, 3),

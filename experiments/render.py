@@ -84,7 +84,7 @@ def load_actor(run: Path) -> tuple[RunConfig, Environment, Act, int]:
         reason = getattr(error, "strerror", None) or error
         raise RunError(f"{run} holds no run: cannot read {run / 'config.json'} ({reason}).") from error
     own_env = loop.make_environment(config)
-    env = own_env if own_env.backend != "mjx" else loop.make_environment(dataclasses.replace(config, backend="mujoco"))
+    env = _on_host(config, own_env)
     _check_view(env, config.env)
     explorer = loop.make_run_explorer(config, own_env)
     init = loop.make_programs(config, own_env, explorer).init
@@ -110,9 +110,19 @@ def load_random(name: str) -> tuple[RunConfig, Environment, Act]:
 
     config = dataclasses.replace(preset_config("laptop", name), method="random")
     env = loop.make_environment(config)
-    env = env if env.backend != "mjx" else loop.make_environment(dataclasses.replace(config, backend="mujoco"))
+    env = _on_host(config, env)
     _check_view(env, name)
     return config, env, jax.jit(loop.make_run_explorer(config, env).act_uniformly)
+
+
+def _on_host(config: RunConfig, env: Environment) -> Environment:
+    """The same environment with its physics on the host, where it has the choice: there nothing is compiled."""
+    import envs
+    from experiments import loop
+
+    if env.backend != "mjx" or config.env not in envs.FACTORIES:
+        return env
+    return loop.make_environment(dataclasses.replace(config, backend="mujoco"))
 
 
 def _check_view(env: Environment, name: str) -> None:

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -117,7 +118,7 @@ def parse(argv: Sequence[str]) -> tuple[CommandLine, RunConfig]:
         ),
         unprefixed=["explorer"],
         choices={
-            "env": list(envs.FACTORIES),
+            "env": [*envs.FACTORIES, *(f"{package}:NAME" for package in envs.ADAPTERS)],
             "method": list(METHODS),
             "backend": ["auto", *ENGINES],
             "activation": list(ACTIVATIONS),
@@ -138,7 +139,8 @@ def choose_directory(command: CommandLine, config: RunConfig) -> Path:
     if command.out is None:
         if command.resume:
             raise ValueError("--resume needs --out: the directory of the run to go on with.")
-        base = RUNS / f"{config.env}-{config.method}-{config.preset}-seed{config.seed}"
+        env = re.sub(r"[^\w.-]", "-", config.env)
+        base = RUNS / f"{env}-{config.method}-{config.preset}-seed{config.seed}"
         names = [base, *(base.with_name(f"{base.name}-{n}") for n in range(2, 10_000))]
         return next(path for path in names if not path.exists())
     out = Path(command.out)

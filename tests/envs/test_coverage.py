@@ -5,7 +5,7 @@ import pytest
 
 from envs import coverage
 from envs.ant_maze import CELLS, POSITION, SPEC
-from envs.base import Coverage
+from envs.base import Coverage, EnvSpec
 
 MAZE = coverage.make_box_coverage(POSITION, CELLS, "maze cells")
 CENTRES = [(0, 0), (2, 0), (4, 0), (4, 2), (4, 4), (2, 4), (0, 4)]
@@ -148,3 +148,67 @@ def test_bad_grids_are_refused(change, message):
     good = {"dims": (0, 1), "low": (0.0, 0.0), "high": (1.0, 1.0), "bins": 2, "unit": "boxes"}
     with pytest.raises(ValueError, match=message):
         coverage.make_grid_coverage(**{**good, **change})
+
+
+def make_spec(size, limits=None, one_hot_obs=False):
+    names = tuple(f"{chr(ord('a') + i)} [m]" for i in range(size))
+    return EnvSpec("made up", names, ("push",), 10, 0.1, one_hot_obs=one_hot_obs, obs_limits=limits)
+
+
+def test_named_entries_are_cut_between_their_limits_or_by_their_arctangent():
+    spec = make_spec(4, ((0.0, 8.0), (-np.inf, np.inf), (-1.0, 1.0), (0.0, 1.0)))
+    grid = coverage.make_entries_coverage(spec, ("0", "b"))
+    assert (grid.num_cells, grid.unit) == (16 * 16, "cells of a [m], b [m]")
+    for a, b, cell in (
+        (0.1, -99.0, 0),
+        (0.4, -99.0, 0),
+        (0.6, -99.0, 16),  # a bin of the first entry is 0.5 m
+        (-5.0, -99.0, 0),  # beyond a limit is the limit
+        (99.0, 99.0, 255),
+        (0.1, -0.99, 4),  # half of the bins lie between -1 and 1
+        (0.1, 0.99, 11),
+        (0.1, np.nan, -1),
+        (np.inf, 0.0, -1),
+    ):
+        obs = jnp.array([a, b, 0.3, 0.4])
+        assert grid.cell(obs) == coverage.make_entries_coverage(spec, (0, 1)).cell(obs) == cell, (a, b)
+    assert coverage.make_entries_coverage(spec, ("d [m]",)).num_cells == 50
+    assert coverage.make_entries_coverage(spec, (3, 0, 1)).num_cells == 8**3
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        (("4",), r"coverage_dims='4' is out of range\. Allowed: 0 to 3, or names: a \[m\], b"),
+        ((-1,), "coverage_dims=-1 is out of range"),
+        (("aa",), r"coverage_dims='aa' is not known\. Did you mean 'a'\? Allowed: a, b, c, d"),
+        ((), r"coverage_dims=\(\)\. Allowed: 1 to 3 entries, each once"),
+        (("0", "a"), r"Allowed: 1 to 3 entries, each once"),
+        ((0, 1, 2, 3), r"Allowed: 1 to 3 entries, each once"),
+    ],
+)
+def test_entries_that_are_not_there_are_refused(entries, message):
+    with pytest.raises(ValueError, match=message):
+        coverage.make_entries_coverage(make_spec(4), entries)
+
+
+def test_the_generic_coverage_is_one_fixed_projection():
+    grid, again = (coverage.make_generic_coverage(make_spec(20)) for _ in range(2))
+    assert grid.num_cells == 256
+    obs = jax.random.normal(jax.random.key(0), (500, 20))
+    cells = jax.vmap(grid.cell)(obs)
+    np.testing.assert_array_equal(cells, jax.vmap(again.cell)(obs))
+    assert cells.min() >= 0
+    assert len(np.unique(cells)) > 60
+    # The middle of all entries is the middle of the grid, where four cells meet.
+    near = jax.vmap(grid.cell)(0.01 * obs)
+    assert set(np.unique(near)) == {7 * 16 + 7, 7 * 16 + 8, 8 * 16 + 7, 8 * 16 + 8}
+    assert grid.cell(obs[0].at[3].set(jnp.nan)) == grid.cell(obs[0].at[3].set(jnp.inf)) == -1
+
+
+def test_where_little_is_seen_nothing_is_projected():
+    two = coverage.make_generic_coverage(make_spec(2))
+    assert (two.num_cells, two.unit) == (256, "cells of a [m], b [m]")
+    assert coverage.make_generic_coverage(make_spec(1)).num_cells == 50
+    states = coverage.make_generic_coverage(make_spec(5, one_hot_obs=True))
+    assert (states.num_cells, int(states.cell(jnp.eye(5)[3]))) == (5, 3)

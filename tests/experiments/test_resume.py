@@ -174,7 +174,7 @@ def test_each_program_is_traced_once(
 
         return call
 
-    make_explorer, make_collect = loop.make_explorer, loop.make_collect
+    make_explorer, make_collect, make_collect_all = loop.make_explorer, loop.make_collect, loop.make_collect_all
 
     def make_counted_explorer(*args):
         explorer = make_explorer(*args)
@@ -183,6 +183,7 @@ def test_each_program_is_traced_once(
 
     monkeypatch.setattr(loop, "make_explorer", make_counted_explorer)
     monkeypatch.setattr(loop, "make_collect", lambda *args: counted("collect", make_collect(*args)))
+    monkeypatch.setattr(loop, "make_collect_all", lambda *args: counted("collect", make_collect_all(*args)))
     out = tmp_path / "run"
     assert tell(out, f"--env={env}", *TINY).status == 0
     assert traces["improve"] == 1

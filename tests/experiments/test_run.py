@@ -141,7 +141,7 @@ def test_a_method_without_a_belief(tell, point: str, tmp_path: Path):
     assert "physics: jax" in told.stdout
     assert "experiments.render" not in told.stdout, "a point has no looks"
     last = rows(told.out)[-1]
-    assert set(last) == {"step", "seed", "coverage", "cells"}
+    assert set(last) == {"step", "seed", "coverage", "cells", "dropped"}
     with np.load(told.out / "walk.npz") as walk:
         positions = walk["positions"][0]
         np.testing.assert_array_equal(walk["episode_steps"][0], np.arange(60) % 20)

@@ -1,0 +1,366 @@
+"""Any Gymnasium environment: `make("gymnasium:Pendulum-v1")`; `"gymnasium:package:Own-v0"` imports a package first.
+
+A live Gymnasium environment cannot be saved. So a state is what leads to it: the seed of the episode's reset, drawn
+from the key, and the actions since. The live environments are a cache: one that is not where a state says is reset with
+the state's seed and given its actions again. A run that is resumed thus goes on to the bit, provided that the
+environment depends on its seed and its actions alone; one that does not is found out and refused then.
+
+- Observations: a Box of one axis; a Dict of such, one after the other in its own order; or Discrete, which becomes
+  one-hot. Pictures and everything else are refused.
+- Actions: a Box with finite limits, which [-1, 1] is stretched to; or Discrete, which becomes one-hot.
+- Gymnasium's own time limit is taken off: an episode is cut after the registered number of steps, or after 1,000 where
+  there is none, as `truncated`. What the environment itself calls terminated or truncated stays that.
+- Seeds side by side are one vector environment of Gymnasium's, without its resets.
+- Coverage: see `envs.coverage.make_generic_coverage`.
+"""
+# pyright: reportArgumentType=false, reportReturnType=false, reportAttributeAccessIssue=false
+# NumPy arrays stand where the contract says Array, and mujoco ships no stubs.
+
+import importlib
+import numbers
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import gymnasium
+import jax
+import numpy as np
+from flax import struct
+from gymnasium import spaces
+from gymnasium.envs.registration import registry
+from gymnasium.vector import AutoresetMode
+
+from envs.base import Environment, EnvSpec, EnvState, View, check_noise
+from envs.coverage import make_generic_coverage
+from jaxplore import validate
+from jaxplore.types import Key, Transition
+
+BACKEND = "gymnasium"
+EPISODE_STEPS = 1_000
+"""Where an environment is registered without a time limit."""
+
+
+@struct.dataclass
+class Past:
+    """What leads to a state of a Gymnasium environment."""
+
+    seed: np.ndarray
+    """Of the episode's reset, uint32."""
+    actions: np.ndarray
+    """The episode's actions in [-1, 1], one-hot or not, float32 `[episode_steps, A]`; zeros from `num_steps` on."""
+    obs: np.ndarray
+    """The observation that they lead to, without added noise, `[O]`."""
+
+
+def check_name(name: str) -> None:
+    """Raise `ValueError` unless `name` is an id in Gymnasium's registry, or `module:id`, to import first."""
+    module, colon, env_id = name.rpartition(":")
+    if colon:
+        try:
+            importlib.import_module(module)
+        except ImportError as error:
+            raise ValueError(f"env='gymnasium:{name}': cannot import {module!r} ({error}). Install it.") from error
+    validate.one_of("env", f"gymnasium:{env_id}", (f"gymnasium:{known}" for known in registry))
+
+
+def make_environment(
+    name: str, backend: str = "auto", obs_noise: float = 0.0, episode_steps: int | None = None
+) -> Environment:
+    """The Gymnasium environment called `name`. See the module's text for what becomes of its parts.
+
+    `step` raises `ValueError` for an action that is not finite or not of shape `[A]`, and clips it to [-1, 1].
+
+    Args:
+        name: an id in Gymnasium's registry, or `module:id`.
+        backend: `auto` or `gymnasium`.
+        obs_noise: standard deviation of Gaussian noise added to every observation entry, in raw units.
+        episode_steps: steps after which an episode is truncated; by default the registered number, or 1,000.
+
+    Raises:
+        ValueError: no such environment, one that cannot be made here, or one whose observations or actions are of a
+            kind that is not supported.
+    """
+    check_name(name)
+    validate.one_of("backend", backend, ("auto", BACKEND))
+    obs_noise = check_noise(obs_noise)
+    env_id = name.rpartition(":")[2]
+    probe = _make(env_id)
+    limit = registry[env_id].max_episode_steps
+    limit = episode_steps if episode_steps is not None else limit if limit and limit > 0 else EPISODE_STEPS
+    validate.at_least("episode_steps", limit, 1)
+    obs_names, obs_limits = _observations(env_id, probe.observation_space)
+    action_names = _actions(env_id, probe.action_space)
+    spec = EnvSpec(
+        name=f"gymnasium:{name}",
+        obs_names=obs_names,
+        action_names=action_names,
+        episode_steps=limit,
+        dt=_seconds(probe),
+        discrete=isinstance(probe.action_space, spaces.Discrete),
+        one_hot_obs=isinstance(probe.observation_space, spaces.Discrete),
+        obs_limits=obs_limits,
+    )
+    live = Live(env_id, probe.observation_space, probe.action_space)
+
+    @jax.jit
+    def start(keys: Key) -> tuple[Any, Key]:
+        def one(key: Key) -> tuple[Any, Key]:
+            start_key, key = jax.random.split(key)
+            return jax.random.bits(start_key, (), "uint32") >> 1, key
+
+        return jax.vmap(one)(keys)
+
+    @jax.jit
+    def draw(keys: Key) -> tuple[Key, Any]:
+        def one(key: Key) -> tuple[Key, Any]:
+            key, noise_key = jax.random.split(key)
+            return key, obs_noise * jax.random.normal(noise_key, (spec.obs_size,), "float32")
+
+        return jax.vmap(one)(keys)
+
+    def noisy(keys: list[Key], obs: list[np.ndarray]) -> tuple[list[Key], list[np.ndarray]]:
+        if obs_noise == 0:
+            return keys, obs
+        after, noise = draw(jax.numpy.stack(keys))
+        return list(after), [clean + extra for clean, extra in zip(obs, jax.device_get(noise), strict=True)]
+
+    def reset_all(keys: Key) -> tuple[EnvState, ...]:
+        seeds, after = start(keys)
+        blank = np.zeros((limit, spec.action_size), np.float32)
+        pasts = [Past(seed, blank, live.start(int(seed))) for seed in jax.device_get(seeds)]
+        own, obs = noisy(list(after), [past.obs for past in pasts])
+        return tuple(EnvState(past, seen, np.int32(0), key) for past, seen, key in zip(pasts, obs, own, strict=True))
+
+    def step_all(states: tuple[EnvState, ...], actions: np.ndarray) -> tuple[tuple[EnvState, ...], Transition]:
+        # Not asarray: on an array still being computed NumPy waits with Python's lock held, and can hang.
+        actions = np.asarray(jax.device_get(actions), np.float32)
+        if actions.shape != (len(states), spec.action_size):
+            raise ValueError(f"action has shape {actions.shape[1:]}. Allowed: {(spec.action_size,)}.")
+        if not np.isfinite(actions).all():
+            raise ValueError(f"action is {actions}. Allowed: finite numbers.")
+        actions = np.eye(spec.action_size, dtype=np.float32)[actions.argmax(-1)] if spec.discrete else actions
+        actions = np.clip(actions, -1.0, 1.0)
+        counts = [int(state.num_steps) for state in states]
+        pasts, rewards, terminated, truncated = live.step([state.physics for state in states], counts, actions)
+        keys, obs = noisy([state.key for state in states], [past.obs for past in pasts])
+        after = tuple(
+            EnvState(past, seen, np.int32(count + 1), key)
+            for past, seen, count, key in zip(pasts, obs, counts, keys, strict=True)
+        )
+        broken = [not np.isfinite(past.obs).all() for past in pasts]
+        transitions = Transition(
+            obs=np.stack([state.obs for state in states]),
+            action=actions,
+            reward=rewards.astype(np.float32),
+            next_obs=np.stack(obs),
+            terminated=terminated | np.array(broken),
+            truncated=truncated | (np.array(counts) + 1 >= limit),
+        )
+        return after, transitions
+
+    def reset(key: Key) -> EnvState:
+        return reset_all(key[None])[0]
+
+    def step(state: EnvState, action: Any) -> tuple[EnvState, Transition]:
+        action = np.asarray(jax.device_get(action), np.float32)
+        states, transitions = step_all((state,), action[None])
+        return states[0], jax.tree.map(lambda leaf: leaf[0], transitions)
+
+    view = None
+    if "rgb_array" in (probe.metadata.get("render_modes") or ()):
+        view = _make_view(live, hasattr(probe.unwrapped, "mujoco_renderer"))
+    coverage = make_generic_coverage(spec)
+    probe.close()
+    return Environment(spec, reset, step, coverage, BACKEND, False, view=view, reset_all=reset_all, step_all=step_all)
+
+
+class Live:
+    """Live environments, and where in which episode each is. Not for two threads at once.
+
+    Args:
+        env_id: in Gymnasium's registry.
+        obs_space: what it shows.
+        action_space: what it takes.
+    """
+
+    def __init__(self, env_id: str, obs_space: spaces.Space, action_space: spaces.Space) -> None:
+        self._id, self._obs_space, self._action_space = env_id, obs_space, action_space
+        self._vectors: dict[int, tuple[gymnasium.vector.SyncVectorEnv, list[tuple[Past, int] | None]]] = {}
+        self._beginner: gymnasium.Env | None = None
+
+    def start(self, seed: int) -> np.ndarray:
+        """The first observation of the episode with this seed, `[O]`."""
+        # In an environment of its own: the others stay where they are until they are stepped.
+        self._beginner = self._beginner or _make(self._id)
+        return _flat(self._obs_space, self._beginner.reset(seed=seed)[0])
+
+    def step(
+        self, pasts: list[Past], counts: list[int], actions: np.ndarray
+    ) -> tuple[list[Past], np.ndarray, np.ndarray, np.ndarray]:
+        """A step of each `[S]`: what leads to the states after it, rewards, terminated, truncated."""
+        size = len(pasts)
+        if size not in self._vectors:
+            self._vectors[size] = self._make_vector(size), [None] * size
+        vector, at = self._vectors[size]
+        stray = np.array([not _same(*pair) for pair in zip(at, zip(pasts, counts, strict=True), strict=True)])
+        first = None
+        if stray.any():
+            seeds = [int(past.seed) if lost else None for past, lost in zip(pasts, stray, strict=True)]
+            first, _ = vector.reset(seed=seeds, options={"reset_mask": stray})
+        for i in np.flatnonzero(stray):
+            at[i] = None
+            obs = _flat(self._obs_space, _own(first, i))
+            for action in pasts[i].actions[: counts[i]]:
+                obs = _flat(self._obs_space, vector.envs[i].step(_native(self._action_space, action))[0])
+            self._check(obs, pasts[i])
+        natives = np.stack([_native(self._action_space, action) for action in actions])
+        obs, rewards, terminated, truncated, _ = vector.step(natives)
+        after = []
+        for i, (past, count) in enumerate(zip(pasts, counts, strict=True)):
+            done = past.actions.copy()
+            # Steps beyond the time limit are nobody's business, but an array has an end.
+            done[min(count, len(done) - 1)] = actions[i]
+            after.append(Past(past.seed, done, _flat(self._obs_space, _own(obs, i))))
+            # One that has ended is not stepped on; whoever wants to is led there anew.
+            at[i] = None if terminated[i] or truncated[i] else (after[i], count + 1)
+        return after, rewards, terminated, truncated
+
+    def frames(self, size: dict[str, int], states: Iterable[EnvState]) -> Iterator[np.ndarray]:
+        """A picture of each state, in an environment that is led there."""
+        env = _make(self._id, render_mode="rgb_array", **size)
+        at: tuple[Past, int] | None = None
+        try:
+            for state in states:
+                past, count = state.physics, int(state.num_steps)
+                if at is None or at[1] > count or not _same(at, (past, at[1])):
+                    at = past, 0
+                    env.reset(seed=int(past.seed))
+                for action in past.actions[at[1] : count]:
+                    env.step(_native(self._action_space, action))
+                at = past, count
+                yield np.asarray(env.render())
+        finally:
+            env.close()
+
+    def _check(self, obs: np.ndarray, past: Past) -> None:
+        if not np.array_equal(obs, past.obs, equal_nan=True):
+            raise ValueError(
+                f"env='gymnasium:{self._id}' went elsewhere from the same seed under the same actions, so a saved "
+                "state cannot be gone on from. Allowed: environments that depend on their seed and actions alone."
+            )
+
+    def _make_vector(self, size: int) -> gymnasium.vector.SyncVectorEnv:
+        vector = gymnasium.make_vec(
+            self._id,
+            size,
+            vectorization_mode="sync",
+            vector_kwargs={"autoreset_mode": AutoresetMode.DISABLED},
+            **OPTIONS,
+        )
+        assert isinstance(vector, gymnasium.vector.SyncVectorEnv)
+        for env in vector.envs:
+            _keep_divergence(env)
+        return vector
+
+
+OPTIONS: dict[str, Any] = {"max_episode_steps": -1, "disable_env_checker": True}
+"""For Gymnasium: no time limit of its own."""
+
+
+def _make(env_id: str, **options: Any) -> gymnasium.Env:
+    try:
+        env = gymnasium.make(env_id, **OPTIONS, **options)
+    except (gymnasium.error.Error, ImportError) as error:
+        raise ValueError(f"env='gymnasium:{env_id}' cannot be made here: {error}") from error
+    _keep_divergence(env)
+    return env
+
+
+def _keep_divergence(env: gymnasium.Env) -> None:
+    """Has MuJoCo leave a diverged state as it is, for `terminated` to tell, and not begin anew within an episode."""
+    model: Any = getattr(env.unwrapped, "model", None)
+    if type(model).__name__ == "MjModel":
+        import mujoco
+
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+
+
+def _same(there: tuple[Past, int] | None, wanted: tuple[Past, int]) -> bool:
+    """Whether a live environment is where a state says."""
+    if there is None or there[1] != wanted[1] or there[0].seed != wanted[0].seed:
+        return False
+    return there[0] is wanted[0] or np.array_equal(there[0].actions[: there[1]], wanted[0].actions[: wanted[1]])
+
+
+def _observations(env_id: str, space: spaces.Space) -> tuple[tuple[str, ...], tuple[tuple[float, float], ...]]:
+    """Names and limits of the observation entries. Raises `ValueError` for a space that is not supported."""
+    if isinstance(space, spaces.Discrete):
+        return tuple(f"obs={space.start + i}" for i in range(space.n)), ((0.0, 1.0),) * int(space.n)
+    parts = dict(space.spaces) if isinstance(space, spaces.Dict) else {"obs": space}
+    names, limits = [], []
+    for name, part in parts.items():
+        if not isinstance(part, spaces.Box) or len(part.shape) != 1:
+            picture = isinstance(part, spaces.Box) and len(part.shape) in (2, 3)
+            raise ValueError(
+                f"env='gymnasium:{env_id}' has observations {space}{': pictures' if picture else ''}. "
+                "Allowed: a Box of one axis, a Dict of such, or Discrete."
+            )
+        names += [f"{name}[{i}]" for i in range(part.shape[0])]
+        limits += zip(part.low.astype(float).tolist(), part.high.astype(float).tolist(), strict=True)
+    return tuple(names), tuple(limits)
+
+
+def _actions(env_id: str, space: spaces.Space) -> tuple[str, ...]:
+    """Names of the action entries or choices. Raises `ValueError` for a space that is not supported."""
+    if isinstance(space, spaces.Discrete):
+        return tuple(f"action={space.start + i}" for i in range(space.n))
+    if isinstance(space, spaces.Box) and np.isfinite(space.low).all() and np.isfinite(space.high).all():
+        return tuple(f"action[{i}]" for i in range(space.low.size))
+    raise ValueError(f"env='gymnasium:{env_id}' has actions {space}. Allowed: a Box with finite limits, or Discrete.")
+
+
+def _own(obs: Any, i: int) -> Any:
+    """One environment's part of what a vector environment shows."""
+    return {name: part[i] for name, part in obs.items()} if isinstance(obs, dict) else obs[i]
+
+
+def _flat(space: spaces.Space, obs: Any) -> np.ndarray:
+    """An observation as the contract has it, float32 `[O]`."""
+    if isinstance(space, spaces.Discrete):
+        return np.eye(int(space.n), dtype=np.float32)[int(obs) - int(space.start)]
+    if isinstance(space, spaces.Dict):
+        return np.concatenate([np.asarray(obs[name], np.float32) for name in space.spaces])
+    return np.array(obs, np.float32)
+
+
+def _native(space: spaces.Space, action: np.ndarray) -> Any:
+    """An action in [-1, 1] `[A]`, or a one-hot choice, as the environment takes it."""
+    if isinstance(space, spaces.Discrete):
+        return space.start + np.argmax(action)
+    assert isinstance(space, spaces.Box)
+    low, high = space.low.astype(float), space.high.astype(float)
+    # In this form actions of limits -1 and 1 stay as they are, to the bit.
+    stretched = (low + high) / 2 + (high - low) / 2 * action.reshape(space.shape)
+    return np.clip(stretched, low, high).astype(space.dtype)
+
+
+def _seconds(env: gymnasium.Env) -> float:
+    """Seconds of a step: the environment's own `dt`, or one frame, or 1."""
+    try:
+        dt = getattr(env.unwrapped, "dt", None)
+    except Exception:  # A property of anybody's.
+        dt = None
+    if not (isinstance(dt, numbers.Real) and 0 < float(dt) < np.inf):
+        dt = 1.0 / (env.metadata.get("render_fps") or 1)
+    return float(dt)
+
+
+def _make_view(live: Live, uses_mujoco: bool) -> View:
+    """The environment's own pictures, stretched to the size that is asked for."""
+
+    def frames(states: Iterable[EnvState], height: int, width: int, camera: str) -> Iterator[np.ndarray]:
+        for picture in live.frames({"width": width, "height": height} if uses_mujoco else {}, states):
+            rows = np.arange(height) * picture.shape[0] // height
+            columns = np.arange(width) * picture.shape[1] // width
+            yield picture[rows[:, None], columns, :3]
+
+    return View(frames, ("own",), uses_mujoco)
