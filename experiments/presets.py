@@ -42,6 +42,32 @@ SMOKE = dataclasses.replace(
 )
 """The laptop's settings cut down until nothing can be learned: it shows that everything runs."""
 
+NCHAIN_PAPER = ExplorationConfig(
+    warm_up_steps=147,
+    steps_per_round=1,
+    planner="mcts",
+    dynamics=DynamicsConfig(hidden=(256, 256, 256, 256), activation="tanh", target="one_hot"),
+    svgd=SVGDConfig(num_particles=5),
+    fit=FitConfig(lr=1e-4, weight_decay=1e-6, batch_size=32, epochs=10, restart=False),
+    imagination=ImaginationConfig(num_models=5),
+)
+"""The paper's agent for the chain: after every step 10 further epochs, 5 new draws, and a tree search in them. Random
+are the first 3 episodes of 49 steps; batch 32 is ours, as the paper is silent on both."""
+
+NCHAIN_LAPTOP = dataclasses.replace(
+    NCHAIN_PAPER,
+    dynamics=dataclasses.replace(NCHAIN_PAPER.dynamics, hidden=(64, 64)),
+    fit=dataclasses.replace(NCHAIN_PAPER.fit, lr=1e-3, epochs=0, steps=30),
+)
+"""The same with small networks, and as many gradient steps at the end of a run as at its start."""
+
+NCHAIN_SMOKE = dataclasses.replace(
+    NCHAIN_LAPTOP,
+    dynamics=dataclasses.replace(NCHAIN_PAPER.dynamics, hidden=(16,)),
+    fit=dataclasses.replace(NCHAIN_LAPTOP.fit, steps=2),
+)
+"""Nothing can be learned with these."""
+
 DEFAULTS: dict[str, dict[str, Any]] = {
     "laptop": {"explorer": LAPTOP},
     "paper": {"explorer": ExplorationConfig()},
@@ -60,6 +86,12 @@ ENVIRONMENTS: dict[str, dict[str, dict[str, Any]]] = {
         "laptop": {"explorer": dataclasses.replace(LAPTOP, warm_up_steps=50)},
         "paper": {"explorer": ExplorationConfig(warm_up_steps=50)},
         "smoke": {"explorer": dataclasses.replace(SMOKE, warm_up_steps=50)},
+    },
+    # 15 episodes of 49 steps.
+    "nchain": {
+        "laptop": {"explorer": NCHAIN_LAPTOP, "steps": 735, "checkpoint_every": 147},
+        "paper": {"explorer": NCHAIN_PAPER, "steps": 735, "checkpoint_every": 147},
+        "smoke": {"explorer": NCHAIN_SMOKE, "steps": 196, "checkpoint_every": 98},
     },
 }
 """Environment -> preset -> the fields in which it departs from the defaults. A new environment adds its own."""
