@@ -162,7 +162,9 @@ def make_generic_coverage(spec: EnvSpec) -> Coverage:
     directions = np.linalg.qr(random)[0].T.astype(np.float32)
     squash = _make_squash(spec)
     grid = make_grid_coverage((0, 1), (-1.0, -1.0), (1.0, 1.0), PROJECTION_BINS, "cells", clip=True)
-    return Coverage(grid.num_cells, lambda obs: grid.cell(directions @ squash(obs)), "cells of a random projection")
+    return Coverage(
+        grid.num_cells, lambda obs: grid.cell(jnp.asarray(directions) @ squash(obs)), "cells of a random projection"
+    )
 
 
 def _find_entry(spec: EnvSpec, entry: str | int) -> int:

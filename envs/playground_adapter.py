@@ -1,9 +1,9 @@
 """Any MuJoCo Playground environment: `make("playground:CartpoleBalance")`. Pure JAX, on MJX.
 
-See `envs.brax_like` for what becomes of its parts. Observations (of several, the one named "state"), actions in [-1, 1],
-rewards and the length of an episode are Playground's own. The control suite (`CartpoleBalance`, `PendulumSwingup`, ...)
-ships with the package; for most robots Playground downloads their models the first time. Coverage: see
-`envs.coverage.make_generic_coverage`.
+See `envs.brax_like` for what becomes of its parts. Observations (of several, the one named "state"), actions in
+[-1, 1], rewards and the length of an episode are Playground's own. The control suite (`CartpoleBalance`,
+`PendulumSwingup`, ...) ships with the package; for most robots Playground downloads their models the first time.
+Coverage: see `envs.coverage.make_generic_coverage`.
 """
 
 import functools

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
+import envs
 from experiments import log, loop, run
 from experiments.checkpoint import Checkpoints
 from experiments.config import PRESETS, flag, from_json, preset_config, to_json
@@ -21,7 +22,7 @@ from experiments.errors import RunError
 from experiments.flags import document
 from jaxplore import beliefs, methods
 from jaxplore.methods import Method
-from tests.experiments.tiny import CELLS, ROOT, STEPS, TINY, assert_same_run, leaves, rows
+from tests.experiments.tiny import CELLS, ROOT, STEPS, TINY, assert_same_run, leaves, make_point, rows
 
 # Rounds that end at 25, 30, 50 and 60; checkpoints at 25, 50 and 60.
 RANDOM = (
@@ -535,3 +536,24 @@ def test_numbers_are_looked_at_by_name():
             75,
             Path("run"),
         )
+
+
+def test_steps_that_diverged_are_dropped_counted_and_told(tell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A point whose 5th step of each episode of 5 leads nowhere: 60 steps of two seeds have 12 such each."""
+
+    def make_broken(backend: str = "auto", obs_noise: float = 0.0):
+        env = make_point()
+
+        def step(state, action):
+            after, transition = env.step(state, action)
+            broken = after.num_steps >= 5
+            next_obs = jnp.where(broken, jnp.nan, transition.next_obs)
+            return after, transition._replace(next_obs=next_obs, terminated=broken)
+
+        return dataclasses.replace(env, step=step)
+
+    monkeypatch.setitem(envs.FACTORIES, "point", make_broken)
+    told = tell(tmp_path / "run", *RANDOM, "--num-seeds=2")
+    assert told.status == 0
+    assert [row["dropped"] for row in rows(told.out)] == [5, 5, 1, 1, 4, 4, 2, 2]
+    assert "24 steps dropped: physics that diverged" in told.stdout
