@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +22,7 @@ import envs
 from benchmarks import flops
 from benchmarks.timing import Timing, matmul_rate, measure
 from envs.base import Environment
+from envs.gymnasium_api import gymnasium_id
 from experiments import loop
 from experiments.config import RunConfig, preset_config
 from experiments.run import use_compilation_cache, versions
@@ -60,18 +62,41 @@ def _result(kernel: str, shape: str, timing: Timing, flop: float | None = None, 
     return Result(kernel, shape, timing.best, timing.median, timing.compile, flop, floor)
 
 
-def environment_steps(backend: str, num_envs: int, steps: int) -> Result:
-    """Random actions in the Ant maze: C MuJoCo one after the other, MJX under `vmap`."""
-    env = envs.make("ant_maze", backend=backend)
-    call = _mjx_steps(env, num_envs, steps) if env.compiled else _host_steps(env, steps)
-    timing = measure(call, repeats=3, inner=steps * num_envs)
-    name = f"environment step, {'MJX' if env.compiled else 'C MuJoCo'}"
-    result = _result(name, f"{num_envs} in parallel", timing)
-    return dataclasses.replace(result, per_second=1.0 / timing.best)
+def environment_steps(name: str, backend: str, num_envs: int, steps: int) -> Result:
+    """Random actions in an environment: on the host one after the other, on the device under `vmap`."""
+    env = envs.make(name, backend=backend)
+    call = _device_steps(env, num_envs, steps) if env.compiled else _host_steps(env, steps)
+    engine = {"mjx": "MJX", "mujoco": "C MuJoCo", "jax": "JAX"}[env.backend]
+    return _steps(f"{name}, {engine}", f"{num_envs} in parallel", call, steps * num_envs)
+
+
+def vector_steps(name: str, num_envs: int, steps: int, mode: str) -> Result:
+    """The same with C MuJoCo through Gymnasium's vector environments: `sync`, or a process each (`async`)."""
+    # Processes start afresh, as a fork of one that runs JAX can hang; "envs:" is what they import.
+    options = {"context": "spawn"} if mode == "async" else {}
+    id_ = f"envs:{gymnasium_id(name)}"
+    vector = gymnasium.make_vec(id_, num_envs, vectorization_mode=mode, vector_kwargs=options, backend="mujoco")
+    actions = np.random.default_rng(0).uniform(-1, 1, (steps, *vector.action_space.shape)).astype(np.float32)
+
+    def call() -> np.ndarray:
+        obs, _ = vector.reset(seed=0)
+        for action in actions:
+            obs = vector.step(action)[0]
+        return obs
+
+    try:
+        return _steps(f"{name}, C MuJoCo, Gymnasium {mode}", f"{num_envs} in parallel", call, steps * num_envs)
+    finally:
+        vector.close()
+
+
+def _steps(kernel: str, shape: str, call: Callable[[], Any], inner: int) -> Result:
+    timing = measure(call, repeats=3, inner=inner)
+    return dataclasses.replace(_result(kernel, shape, timing), per_second=1.0 / timing.best)
 
 
 def _host_steps(env: Environment, steps: int) -> Callable[[], Any]:
-    actions = np.random.default_rng(0).uniform(-1, 1, (steps, ACTION)).astype(np.float32)
+    actions = np.random.default_rng(0).uniform(-1, 1, (steps, env.spec.action_size)).astype(np.float32)
 
     def call() -> np.ndarray:
         state = env.reset(jax.random.key(0))
@@ -82,12 +107,13 @@ def _host_steps(env: Environment, steps: int) -> Callable[[], Any]:
     return call
 
 
-def _mjx_steps(env: Environment, num_envs: int, steps: int) -> Callable[[], Any]:
+def _device_steps(env: Environment, num_envs: int, steps: int) -> Callable[[], Any]:
+    shape = (num_envs, env.spec.action_size)
+
     @jax.jit
     def call_all(keys: jax.Array) -> jax.Array:
         def step(states: Any, key: jax.Array) -> tuple[Any, None]:
-            actions = jax.random.uniform(key, (num_envs, ACTION), minval=-1.0, maxval=1.0)
-            return jax.vmap(env.step)(states, actions)[0], None
+            return jax.vmap(env.step)(states, jax.random.uniform(key, shape, minval=-1.0, maxval=1.0))[0], None
 
         states = jax.vmap(env.reset)(keys)
         return jax.lax.scan(step, states, jax.random.split(jax.random.key(1), steps))[0].obs
@@ -232,9 +258,16 @@ def _widths(hidden: tuple[int, ...]) -> str:
 def run_all(rate: float, *, quick: bool) -> Iterator[Result]:
     """Every line of the table, in order."""
     laptop, paper = preset_config("laptop"), preset_config("paper")
-    yield environment_steps("mujoco", 1, 500)
-    for num_envs in (1, 16) if quick else (1, 16, 256):
-        yield environment_steps("mjx", num_envs, 50 if num_envs == 1 else 10)
+    for name in ("ant_maze", "half_cheetah", "hand_block"):
+        yield environment_steps(name, "mujoco", 1, 300)
+        for mode in ("sync", "async"):
+            yield vector_steps(name, 4, 300, mode)
+        # The hand's programs take minutes to compile on a CPU.
+        for num_envs in (16,) if quick or name == "hand_block" else (1, 16, 256):
+            yield environment_steps(name, "mjx", num_envs, 50 if num_envs == 1 else 10)
+    for name in ("nchain", "acrobot", "mountain_car"):
+        for num_envs in (1, 1024):
+            yield environment_steps(name, "jax", num_envs, 1000)
     for run, inner in ((laptop, 50), (paper, 3)):
         yield svgd_step(run.explorer, rate, inner)
         yield imagined_step(run.explorer, rate)

@@ -1,11 +1,14 @@
 """The README's code runs, and its map of the folders is the tree's."""
 
+import json
 import re
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
+import envs
 import jaxplore
 
 ROOT = Path(__file__).parent.parent
@@ -13,8 +16,27 @@ FOLDERS = ("jaxplore", "envs", "experiments")
 README = (ROOT / "README.md").read_text()
 
 
+def example(word: str) -> str:
+    """The README's one Python example with `word` in it."""
+    (code,) = [code for code in re.findall(r"```python\n(.*?)```", README, re.DOTALL) if word in code]
+    return code
+
+
+def test_an_environment_of_your_own_takes_30_lines_and_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(envs, "FACTORIES", dict(envs.FACTORIES))
+    code = example("make_puck")
+    assert len([line for line in code.splitlines() if line.strip()]) <= 30
+    exec(code, {})
+    (run,) = (tmp_path / "runs").iterdir()
+    assert (run / "visitation.png").is_file()
+    last = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])
+    assert last["step"] == 600
+    assert 4 <= last["cells"] <= 16
+
+
 def test_the_python_example_runs_and_its_networks_fit_the_data():
-    (code,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    code = example("make_amortized_svgd")
     names: dict = {}
     exec(code, names)
     predictions = np.stack([names["net"].apply({"params": take(names["networks"], i)}, names["x"]) for i in range(100)])
