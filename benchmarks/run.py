@@ -76,7 +76,7 @@ def vector_steps(name: str, num_envs: int, steps: int, mode: str) -> Result:
     options = {"context": "spawn"} if mode == "async" else {}
     id_ = f"envs:{gymnasium_id(name)}"
     vector = gymnasium.make_vec(id_, num_envs, vectorization_mode=mode, vector_kwargs=options, backend="mujoco")
-    actions = np.random.default_rng(0).uniform(-1, 1, (steps, *vector.action_space.shape)).astype(np.float32)
+    actions = np.random.default_rng(0).uniform(-1, 1, (steps, *(vector.action_space.shape or ()))).astype(np.float32)
 
     def call() -> np.ndarray:
         obs, _ = vector.reset(seed=0)

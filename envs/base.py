@@ -81,6 +81,12 @@ class Coverage(NamedTuple):
     reachable: int | None = None
     """How many of the cells can be reached, where that is known and not all: shown wherever coverage is."""
 
+    @property
+    def size(self) -> str:
+        """How many cells there are, in words: `"7"`, or `"512, of which 256 can be reached"`."""
+        rest = "" if self.reachable is None else f", of which {self.reachable:,} can be reached"
+        return f"{self.num_cells:,}{rest}"
+
 
 class FloorPlan(NamedTuple):
     """A view from above, for pictures. Metres."""

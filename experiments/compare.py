@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from envs.base import Coverage
 from experiments import plot
 from experiments.config import RunConfig, from_json
 from experiments.errors import RunError, disk_error
@@ -104,15 +105,17 @@ def group(runs: Sequence[Path]) -> tuple[RunConfig, list[Group]]:
     return first, groups
 
 
-def table(groups: Sequence[Group], num_cells: int, unit: str) -> str:
+def table(groups: Sequence[Group], coverage: Coverage) -> str:
     """A Markdown table: medians, and ranges in brackets."""
+    most = coverage.reachable or coverage.num_cells
+    seen = f"{coverage.unit} of {coverage.size}: median (range)"
     lines = [
-        f"| method | seeds | {unit} of {num_cells}: median (range) | each seed | all seen at step | minutes |",
+        f"| method | seeds | {seen} | each seed | all seen at step | minutes |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
     for one in groups:
         cells = [outcome.cells for outcome in one.outcomes]
-        whole = [f"{outcome.reached[-1]:,}" for outcome in one.outcomes if outcome.cells == num_cells]
+        whole = [f"{outcome.reached[-1]:,}" for outcome in one.outcomes if outcome.cells == most]
         minutes = statistics.median(outcome.minutes for outcome in one.outcomes)
         lines.append(
             f"| `{one.label}` | {len(cells)} | {statistics.median(cells):g} ({min(cells)} to {max(cells)}) "
@@ -142,7 +145,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         print(f"error: {disk_error('write the comparison', arguments.out, error)}", file=sys.stderr)
         return 1
-    print(table(groups, env.coverage.num_cells, env.coverage.unit))
+    print(table(groups, env.coverage))
     total = sum(outcome.minutes for one in groups for outcome in one.outcomes)
     print(f"\n{duration(60 * total)} of wall time in all; written to {arguments.out}")
     return 0

@@ -341,7 +341,7 @@ def duration(seconds: float) -> str:
 def summary(
     rows: Sequence[Row],
     *,
-    num_cells: int,
+    size: str,
     unit: str = "cells",
     files: Mapping[str, str | os.PathLike[str]] | None = None,
 ) -> str:
@@ -349,7 +349,7 @@ def summary(
 
     Args:
         rows: all rows of the run, as `read_metrics` gives them.
-        num_cells: how many cells there are to see.
+        size: how many cells there are to see (`Coverage.size`).
         unit: what a cell is called, such as `"maze cells"` (`Coverage.unit`).
         files: what to point to below the table, name to path.
 
@@ -359,7 +359,7 @@ def summary(
     """
     if not rows:
         raise ValueError("rows: a run without rows has no summary")
-    head = ("seed", f"{unit} (of {num_cells})", "last new at step", "steps", "time", "steps/s")
+    head = ("seed", f"{unit} (of {size})", "last new at step", "steps", "time", "steps/s")
     write = (lambda n: f"{n:g}", lambda n: f"{n:,.0f}", lambda n: f"{n:,.0f}", duration, lambda n: f"{n:.1f}")
     seeds = sorted({row["seed"] for row in rows})
     values = [(seed, _outcome([row for row in rows if row["seed"] == seed])) for seed in seeds]

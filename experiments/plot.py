@@ -98,7 +98,14 @@ def plot_coverage(
         axes.set_ylim(0, 1.04)
         axes.yaxis.set_major_locator(FixedLocator([0, 0.2, 0.4, 0.6, 0.8, 1]))
         axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
-        axes.set_ylabel("explored")
+        axes.set_ylabel(
+            "explored" if coverage.num_cells <= 12 else f"explored, of {coverage.num_cells:,} {coverage.unit}"
+        )
+        if coverage.reachable is not None:
+            label = f"all {coverage.reachable:,} that can be reached"
+            axes.axhline(
+                coverage.reachable / coverage.num_cells, color="#666666", linewidth=1.2, linestyle="--", label=label
+            )
         if coverage.num_cells <= 12:
             # Coverage can only stand on these lines; naming them saves the reader a division.
             cells = coverage.num_cells

@@ -14,7 +14,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -181,7 +181,9 @@ def draw(
             stills = list(env.view.frames(chosen, height, width, camera))
             imageio.imwrite(draft, np.concatenate(stills, axis=1))
         else:
-            options = {"fps": round(1 / env.spec.dt), "macro_block_size": 2} if path.suffix == ".mp4" else {}
+            options: dict[str, Any] = (
+                {"fps": round(1 / env.spec.dt), "macro_block_size": 2} if path.suffix == ".mp4" else {}
+            )
             # JAX warns of the fork that starts ffmpeg; nothing but ffmpeg runs in it.
             with (
                 warnings.catch_warnings(action="ignore", category=RuntimeWarning),
@@ -235,20 +237,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         from experiments.run import use_compilation_cache
 
         use_compilation_cache()
-        if arguments.env is not None:
+        run: Path | None = arguments.run
+        if run is None:
             (config, env, act), after = load_random(arguments.env), ""
         else:
-            config, env, act, step = load_actor(arguments.run)
+            config, env, act, step = load_actor(run)
             after = f" after {step:,} steps"
         assert env.view is not None
         if env.view.needs_renderer and failed:
             raise failed
-        name = arguments.camera or env.view.cameras[0]
-        default = (
-            Path(f"{arguments.env.replace(':', '-').replace('/', '-')}.mp4")
-            if arguments.env
-            else arguments.run / f"{name}.mp4"
-        )
+        if run is None:
+            default = Path(arguments.env.replace(":", "-").replace("/", "-") + ".mp4")
+        else:
+            default = run / f"{arguments.camera or env.view.cameras[0]}.mp4"
         path = arguments.out or default
         states = episode(env, act, arguments.seed, arguments.steps or env.spec.episode_steps)
         height, width = arguments.size

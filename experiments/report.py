@@ -64,7 +64,7 @@ def write(config: RunConfig, out: Path, env: Environment) -> str:
     if config.explorer.reward_units == "raw":
         unit = "intrinsic reward (raw units, squared)"
     plot.plot_intrinsic_reward(files["reward"], [plot.Curves(config.method, steps, reward)], unit=unit, title=title)
-    table = summary(rows, num_cells=env.coverage.num_cells, unit=env.coverage.unit, files=files)
+    table = summary(rows, size=env.coverage.size, unit=env.coverage.unit, files=files)
     if env.view is not None:
         table += f"\n\nTo see it move: python -m experiments.render {shlex.quote(str(out))}"
     return table

@@ -292,7 +292,7 @@ def test_durations():
 def test_summary_of_one_seed():
     rows = [row for step in range(100, 1001, 100) for row in make_rows(step, 1)]
     assert summary(
-        rows, num_cells=7, unit="maze cells", files={"metrics": "runs/a/metrics.jsonl", "video": Path("x")}
+        rows, size="7", unit="maze cells", files={"metrics": "runs/a/metrics.jsonl", "video": Path("x")}
     ) == (
         "seed   maze cells (of 7)   last new at step   steps         time   steps/s\n"
         "--------------------------------------------------------------------------\n"
@@ -305,7 +305,7 @@ def test_summary_of_one_seed():
 
 def test_summary_of_several_seeds():
     rows = [row for step in range(100, 1001, 100) for row in make_rows(step, 3)]
-    head, _, *seeds, _, median, spread = summary(rows, num_cells=7).splitlines()
+    head, _, *seeds, _, median, spread = summary(rows, size="7").splitlines()
     assert head.startswith("  seed   cells (of 7)")
     assert [line.split()[:3] for line in seeds] == [["0", "4", "900"], ["1", "5", "900"], ["2", "6", "900"]]
     assert median.split()[:3] == ["median", "5", "900"]
@@ -314,4 +314,4 @@ def test_summary_of_several_seeds():
 
 def test_summary_of_nothing():
     with pytest.raises(ValueError, match="rows"):
-        summary([], num_cells=7)
+        summary([], size="7")
