@@ -18,8 +18,8 @@ from experiments.log import duration, read_metrics
 from experiments.loop import make_environment
 from experiments.report import series
 
-GRID = 100
-"""Steps between two points of a comparison: runs of different rounds meet here."""
+POINTS = 100
+"""Points of a comparison, evenly spaced: runs of different rounds meet there."""
 
 
 class Outcome(NamedTuple):
@@ -82,6 +82,9 @@ def group(runs: Sequence[Path]) -> tuple[RunConfig, list[Group]]:
     loaded = [load(run) for run in runs]
     first = loaded[0][0]
     labels = list(dict.fromkeys(config.method for config, _ in loaded))
+    # A first point before the first round has nothing to show: rounds are as long as the warm-up at most.
+    grid = np.unique(np.linspace(first.steps / POINTS, first.steps, POINTS).round().astype(int))
+    grid = grid[grid >= max(min(row["step"] for row in rows) for _, rows in loaded)]
     groups = []
     for label in labels:
         own: list[Outcome] = []
@@ -95,13 +98,13 @@ def group(runs: Sequence[Path]) -> tuple[RunConfig, list[Group]]:
             if config.method != label:
                 continue
             steps, covered = series(rows, "coverage")
-            at = np.searchsorted(steps, np.arange(GRID, config.steps + 1, GRID), side="right") - 1
+            at = np.searchsorted(steps, grid, side="right") - 1
             curves.append(covered[:, at])
             own += outcomes(config, rows)
         seeds = [outcome.seed for outcome in own]
         if len(set(seeds)) < len(seeds):
             raise RunError(f"{label}: seed {statistics.mode(seeds)} comes twice. Give each seed of a method once.")
-        groups.append(Group(label, own, np.arange(GRID, first.steps + 1, GRID), np.concatenate(curves)))
+        groups.append(Group(label, own, grid, np.concatenate(curves)))
     return first, groups
 
 
@@ -135,7 +138,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         env = make_environment(config)
         arguments.out.mkdir(parents=True, exist_ok=True)
         curves = [plot.Curves(one.label, one.steps, one.coverage) for one in groups]
-        plot.plot_coverage(arguments.out / "coverage.png", curves, env.coverage, title=config.env)
+        plot.plot_coverage(
+            arguments.out / "coverage.png", curves, env.coverage, episode_steps=env.spec.episode_steps, title=config.env
+        )
         found = {one.label: [outcome._asdict() for outcome in one.outcomes] for one in groups}
         record = {"env": config.env, "preset": config.preset, "steps": config.steps, "methods": found}
         (arguments.out / "comparison.json").write_text(json.dumps(record, indent=2) + "\n")

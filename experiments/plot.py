@@ -67,8 +67,17 @@ class Curves(NamedTuple):
     """The quantity, `[S, T]`; NaN where there is none."""
 
 
+MOST_EPISODES = 40
+"""Up to so many episodes are worth counting along an axis."""
+
+
 def plot_coverage(
-    path: str | os.PathLike[str], curves: Sequence[Curves], coverage: Coverage, *, title: str | None = None
+    path: str | os.PathLike[str],
+    curves: Sequence[Curves],
+    coverage: Coverage,
+    *,
+    episode_steps: int | None = None,
+    title: str | None = None,
 ) -> None:
     """Draws how much has been seen against environment steps: a thin line per seed, of several their median in bold.
 
@@ -76,6 +85,7 @@ def plot_coverage(
         path: of the PNG to write.
         curves: fractions seen, 0 to 1: one group of lines for a run, several to compare methods.
         coverage: of the environment; what a cell is called and how many there are.
+        episode_steps: of a whole episode; given, and few enough, episodes are counted along the top.
         title: above the picture.
 
     Raises:
@@ -86,6 +96,15 @@ def plot_coverage(
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(6.6, 4.1), layout="constrained")
         axes = figure.subplots()
+        if episode_steps and max(group.steps[-1] for group in curves) <= MOST_EPISODES * episode_steps:
+            length = episode_steps
+            episodes = axes.secondary_xaxis(
+                "top", functions=(lambda step: np.divide(step, length), lambda count: np.multiply(count, length))
+            )
+            episodes.xaxis.set_major_locator(MaxNLocator(10, integer=True))
+            episodes.set_xlabel("episodes")
+            episodes.tick_params(length=2)
+            episodes.spines["top"].set_visible(False)
         for colour, group in zip(_colours(curves), curves, strict=True):
             # A value holds until the next one is known: coverage goes up in steps.
             many = len(group.values) > 1

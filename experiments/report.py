@@ -41,7 +41,13 @@ def write(config: RunConfig, out: Path, env: Environment) -> str:
     title = f"{config.method} on {config.env}"
     steps, covered = series(rows, "coverage")
     files["coverage"] = out / "coverage.png"
-    plot.plot_coverage(files["coverage"], [plot.Curves(config.method, steps, covered)], env.coverage, title=title)
+    plot.plot_coverage(
+        files["coverage"],
+        [plot.Curves(config.method, steps, covered)],
+        env.coverage,
+        episode_steps=env.spec.episode_steps,
+        title=title,
+    )
     if env.floor_plan is not None:
         files["visitation"] = out / "visitation.png"
         positions, episode_steps = _read_walk(out / loop.WALK)
