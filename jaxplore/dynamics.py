@@ -123,6 +123,20 @@ class Encoding(NamedTuple):
     """`next_obs(normalizers, obs [..., O], outputs [..., O]) -> [..., O]`: where that leads, as an observation."""
 
 
+@jax.custom_vjp
+def probabilities(logits: Array) -> Array:
+    """Softmax over the last axis, whose gradient passes straight through to the logits.
+
+    Squared error alone has no gradient where a network is sure and wrong: a pair met for the first time can then keep a
+    wrong successor for good, with all networks agreeing on it. Carried straight to the logits, the residual `y - p` of
+    squared error is the gradient of cross-entropy, which does not vanish.
+    """
+    return jax.nn.softmax(logits)
+
+
+probabilities.defvjp(lambda logits: (jax.nn.softmax(logits), None), lambda _, cotangent: (cotangent,))
+
+
 def _most_likely(normalizers: Normalizers, obs: Array, outputs: Array) -> Array:
     return jax.nn.one_hot(jnp.argmax(outputs, axis=-1), outputs.shape[-1])
 
@@ -133,7 +147,7 @@ DELTA = Encoding(model_inputs, model_targets, lambda last: last, apply_delta)
 ONE_HOT = Encoding(
     inputs=lambda normalizers, obs, action: jnp.concatenate([obs, action], axis=-1),
     targets=lambda normalizers, obs, next_obs: next_obs,
-    outputs=jax.nn.softmax,
+    outputs=probabilities,
     next_obs=_most_likely,
 )
 """Nothing normalised; the network predicts the probability of each next state, and the most likely one comes."""
