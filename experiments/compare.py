@@ -1,6 +1,7 @@
 """`python -m experiments.compare RUN RUN ... --out=DIR`: methods side by side, over the seeds of all their runs."""
 
 import argparse
+import dataclasses
 import json
 import statistics
 import sys
@@ -45,11 +46,11 @@ class Group(NamedTuple):
     """`[S, T]`, 0 to 1."""
 
 
-def load(run: Path) -> tuple[RunConfig, list[dict[str, Any]]]:
-    """The configuration and the rows of a finished run.
+def load(run: Path, until: int | None = None) -> tuple[RunConfig, list[dict[str, Any]]]:
+    """The configuration and the rows of a finished run, or of its first `until` steps as if it had ended there.
 
     Raises:
-        RunError: `run` holds no run, or one that has not finished.
+        RunError: `run` holds no run, or one that has not come that far.
     """
     try:
         config = from_json((run / "config.json").read_text(), str(run / "config.json"))
@@ -57,9 +58,11 @@ def load(run: Path) -> tuple[RunConfig, list[dict[str, Any]]]:
         raise RunError(f"{run} holds no run: cannot read {run / 'config.json'} ({error.strerror}).") from error
     rows = read_metrics(run / "metrics.jsonl")
     last = max((row["step"] for row in rows), default=0)
-    if last < config.steps:
-        raise RunError(f"{run} stands at step {last} of {config.steps}. Finish it with --resume first.")
-    return config, rows
+    if last < (until or config.steps):
+        raise RunError(f"{run} stands at step {last} of {until or config.steps}. Finish it with --resume first.")
+    if until is None:
+        return config, rows
+    return dataclasses.replace(config, steps=until), [row for row in rows if row["step"] <= until]
 
 
 def outcomes(config: RunConfig, rows: Sequence[dict[str, Any]]) -> list[Outcome]:
@@ -73,13 +76,13 @@ def outcomes(config: RunConfig, rows: Sequence[dict[str, Any]]) -> list[Outcome]
     return found
 
 
-def group(runs: Sequence[Path]) -> tuple[RunConfig, list[Group]]:
-    """The runs by method, in the order in which the methods come.
+def group(runs: Sequence[Path], until: int | None = None) -> tuple[RunConfig, list[Group]]:
+    """The runs by method, in the order in which the methods come; of each the first `until` steps, or all.
 
     Raises:
         RunError: runs differ in environment or number of steps, or a seed of a method comes twice.
     """
-    loaded = [load(run) for run in runs]
+    loaded = [load(run, until) for run in runs]
     first = loaded[0][0]
     labels = list(dict.fromkeys(config.method for config, _ in loaded))
     # A first point before the first round has nothing to show: rounds are as long as the warm-up at most.
@@ -132,9 +135,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m experiments.compare", description=__doc__)
     parser.add_argument("runs", type=Path, nargs="+", help="directories of finished runs")
     parser.add_argument("--out", type=Path, required=True, help="directory for coverage.png and comparison.json")
+    parser.add_argument("--until", type=int, help="compare the first so many steps of each run (default: all)")
     arguments = parser.parse_args(argv)
+    if arguments.until is not None and arguments.until < 1:
+        parser.error(f"--until={arguments.until}. Allowed: 1 or more.")
     try:
-        config, groups = group(arguments.runs)
+        config, groups = group(arguments.runs, arguments.until)
         env = make_environment(config)
         arguments.out.mkdir(parents=True, exist_ok=True)
         curves = [plot.Curves(one.label, one.steps, one.coverage) for one in groups]

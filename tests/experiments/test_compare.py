@@ -8,6 +8,7 @@ import pytest
 
 from experiments import compare
 from experiments.config import preset_config, to_json
+from experiments.errors import RunError
 
 
 def write_run(path: Path, method: str, seed: int, reached: list[int], steps: int = 1_000) -> Path:
@@ -52,6 +53,16 @@ def test_curves_hold_the_last_value_known(runs: list[Path]):
     every_tenth = implicit.steps % 100 == 0
     assert list(implicit.coverage[0, every_tenth] * 7) == pytest.approx([2, 2, 3, 4, 4, 4, 4, 4, 4, 5])
     assert list(random.coverage[0, every_tenth] * 7) == pytest.approx([2, 2, 2, 2, 2, 2, 3, 3, 3, 3])
+
+
+def test_runs_of_different_lengths_meet_at_a_step(runs: list[Path], tmp_path: Path):
+    short = write_run(tmp_path / "short", "implicit", 9, [25, 400], steps=500)
+    config, (implicit, random) = compare.group([*runs, short], until=500)
+    assert config.steps == implicit.steps[-1] == 500
+    assert [outcome.cells for outcome in implicit.outcomes] == [4, 6, 4, 2]
+    assert random.outcomes[0].reached == (25, 50)
+    with pytest.raises(RunError, match="short stands at step 500 of 600"):
+        compare.group([short], until=600)
 
 
 @pytest.mark.parametrize(
