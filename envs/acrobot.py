@@ -52,6 +52,7 @@ SPEC = EnvSpec(
     action_names=("torque at the joint between the links [1 N m]",),
     episode_steps=500,
     dt=DT,
+    has_reward=True,
 )
 
 

@@ -56,6 +56,8 @@ class EnvSpec:
     """False: action entries are numbers in [-1, 1]. True: an action is one of `A` choices, as a one-hot `[A]`."""
     one_hot_obs: bool = False
     """Whether an observation is one of `O` states, as a one-hot vector `[O]`."""
+    has_reward: bool = False
+    """Whether `Transition.reward` is a task's. False: it is always 0, and nothing can be learned from it."""
     obs_limits: tuple[tuple[float, float], ...] | None = None
     """Lowest and highest value of each observation entry, infinite where there is none; None: not known."""
 

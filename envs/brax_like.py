@@ -75,6 +75,7 @@ def make_environment(
         action_names=tuple(f"action[{i}]" for i in range(env.action_size)),
         episode_steps=episode_steps,
         dt=float(env.dt),
+        has_reward=True,
     )
     cameras = tuple(model.camera(i).name for i in range(model.ncam)) if model is not None else ()
     rules = functional.Rules(

@@ -97,6 +97,7 @@ def make_environment(
         dt=_seconds(probe),
         discrete=isinstance(probe.action_space, spaces.Discrete),
         one_hot_obs=isinstance(probe.observation_space, spaces.Discrete),
+        has_reward=True,
         obs_limits=obs_limits,
     )
     live = Live(env_id, probe.observation_space, probe.action_space)

@@ -59,6 +59,7 @@ TASK_SPEC = EnvSpec(
     action_names=ACTIONS,
     episode_steps=1_000,
     dt=DT,
+    has_reward=True,
 )
 
 FASTEST = (5.0, 10.0)

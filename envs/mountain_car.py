@@ -42,6 +42,7 @@ SPEC = EnvSpec(
     action_names=("push to the right",),
     episode_steps=500,
     dt=1 / 30,  # A step has no duration; this is how fast Gymnasium shows it.
+    has_reward=True,
 )
 
 

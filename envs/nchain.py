@@ -84,6 +84,7 @@ def make_nchain(backend: str = "auto", obs_noise: float = 0.0, num_states: int =
         dt=1.0,
         discrete=True,
         one_hot_obs=True,
+        has_reward=True,
     )
     num_rows = -(-num_states // LINKS_PER_ROW)
     rules = Rules(

@@ -84,7 +84,7 @@ def make_environment(config: RunConfig) -> Environment:
 def make_run_explorer(config: RunConfig, env: Environment) -> Explorer:
     """The explorer that a configuration names, for its environment."""
     spec = env.spec
-    sizes = Sizes(spec.obs_size, spec.action_size, spec.discrete, spec.one_hot_obs)
+    sizes = Sizes(spec.obs_size, spec.action_size, spec.discrete, spec.one_hot_obs, spec.has_reward)
     return make_explorer(get_method(config.method), sizes, config.explorer)
 
 

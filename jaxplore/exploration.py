@@ -15,7 +15,7 @@ from flax import struct
 from jaxplore import dynamics, replay
 from jaxplore.behaviours import Experience, uniform_actions
 from jaxplore.dynamics import Normalizers
-from jaxplore.methods import ExplorationConfig, Method, Sizes
+from jaxplore.methods import ExplorationConfig, Method, Sizes, check_fits
 from jaxplore.replay import Replay
 from jaxplore.types import Array, Key, Metrics, Transition
 
@@ -67,8 +67,8 @@ def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Ex
         An `Explorer`.
 
     Raises:
-        ValueError: `dynamics.target="one_hot"` where observations are not one-hot, or what a part of the method
-            refuses.
+        ValueError: the method needs another kind of action, or a reward where there is none;
+            `dynamics.target="one_hot"` where observations are not one-hot; or what a part of the method refuses.
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -83,6 +83,7 @@ def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Ex
             "DynamicsConfig.target='one_hot' predicts which of finitely many states comes next, and this environment's "
             "observations are not one-hot. Allowed: 'delta'."
         )
+    check_fits(method, sizes)
     belief = method.belief(sizes, config)
     reward = method.reward(config)
     behaviour = method.behaviour(sizes, config, belief, reward)

@@ -22,6 +22,7 @@ from jaxplore.validate import Checks
 
 RewardUnits = Literal["normalized", "raw"]
 Planner = Literal["sac", "mcts"]
+Actions = Literal["any", "continuous", "discrete"]
 
 
 @dataclass(frozen=True)
@@ -74,6 +75,8 @@ class Sizes(NamedTuple):
     """Whether an action is one of `A` choices, as a one-hot vector; otherwise entries are numbers in [-1, 1]."""
     one_hot_obs: bool = False
     """Whether an observation is one of `O` states, as a one-hot vector."""
+    has_reward: bool = False
+    """Whether there is a task whose reward can be learned from."""
 
 
 class Method(NamedTuple):
@@ -84,6 +87,15 @@ class Method(NamedTuple):
     belief: Callable[[Sizes, ExplorationConfig], Belief]
     reward: Callable[[ExplorationConfig], Reward]
     behaviour: Callable[[Sizes, ExplorationConfig, Belief, Reward], Behaviour]
+    needs_reward: bool = False
+    """Whether it learns from the environment's own reward."""
+    actions: Actions = "any"
+    """Which actions it can choose."""
+
+    def fits(self, sizes: Sizes) -> bool:
+        """Whether it can run in an environment of these sizes, as far as this row says."""
+        kind = "discrete" if sizes.discrete else "continuous"
+        return self.actions in ("any", kind) and (sizes.has_reward or not self.needs_reward)
 
 
 def generator_belief(sizes: Sizes, config: ExplorationConfig) -> Belief:
@@ -149,12 +161,7 @@ def uniform_actions(sizes: Sizes, config: ExplorationConfig, belief: Belief, rew
 
 
 def ddqn_on_task_reward(sizes: Sizes, config: ExplorationConfig, belief: Belief, reward: Reward) -> Behaviour:
-    """Double DQN on real transitions, with the environment's own reward. Refuses actions that are not discrete."""
-    if not sizes.discrete:
-        raise ValueError(
-            f"method='ddqn' chooses one of several actions; here an action is numbers in [-1, 1], {sizes.action} of "
-            "them. Allowed: an environment with discrete actions, or a method for continuous ones, such as implicit."
-        )
+    """Double DQN on real transitions, with the environment's own reward."""
     model_free = dataclasses.replace(
         config.model_free, normalize_obs=config.model_free.normalize_obs and not sizes.one_hot_obs
     )
@@ -175,10 +182,35 @@ METHODS: dict[str, Method] = {
         no_belief,
         no_reward,
         ddqn_on_task_reward,
+        needs_reward=True,
+        actions="discrete",
     ),
     "random": Method("uniform random actions", no_belief, no_reward, uniform_actions),
 }
 """Name -> method. Add your own with `METHODS["mine"] = Method(...)`."""
+
+
+def check_fits(method: Method, sizes: Sizes) -> None:
+    """Raise unless `method` can run in an environment of these sizes, as far as its row says.
+
+    Raises:
+        ValueError: names what it needs, and the methods that fit.
+    """
+    if method.fits(sizes):
+        return
+    name = next((f"method={name!r}" for name, row in METHODS.items() if row is method), "this method")
+    fitting = ", ".join(name for name, row in METHODS.items() if row.fits(sizes))
+    if method.needs_reward and not sizes.has_reward:
+        raise ValueError(
+            f"{name} learns from the environment's own reward, and this environment has none. "
+            f"Allowed: an environment with a reward (EnvSpec.has_reward), or one of the methods {fitting}."
+        )
+    wanted = "one of several choices" if method.actions == "discrete" else "numbers in [-1, 1]"
+    given = f"one of {sizes.action} choices" if sizes.discrete else f"numbers in [-1, 1], {sizes.action} of them"
+    raise ValueError(
+        f"{name} takes actions that are {wanted}; here an action is {given}. "
+        f"Allowed: an environment with {method.actions} actions, or one of the methods {fitting}."
+    )
 
 
 def get_method(name: str) -> Method:

@@ -116,9 +116,23 @@ def test_one_hot_observations_are_never_normalised():
 
 
 def test_ddqn_refuses_continuous_actions():
-    method, sizes, config = METHODS["ddqn"], Sizes(6, 2), ExplorationConfig()
-    with pytest.raises(ValueError, match=r"method='ddqn' .*numbers in \[-1, 1\].*Allowed: .*discrete actions"):
-        make_explorer(method, sizes, config)
+    sizes = Sizes(6, 2, has_reward=True)
+    with pytest.raises(ValueError, match=r"method='ddqn' .*numbers in \[-1, 1\], 2 of.*discrete actions, or .*random"):
+        make_explorer(METHODS["ddqn"], sizes, ExplorationConfig())
+
+
+def test_methods_that_need_a_reward_are_refused_where_there_is_none():
+    # and the message lists every method that fits, and none that does not
+    for name, row in METHODS.items():
+        sizes = Sizes(6, 2, discrete=row.actions == "discrete")
+        assert row.fits(sizes._replace(has_reward=True))
+        assert row.fits(sizes) == (not row.needs_reward)
+        if row.needs_reward:
+            with pytest.raises(ValueError, match=rf"method='{name}' .*environment has none\. Allowed: ") as caught:
+                make_explorer(row, sizes, ExplorationConfig())
+            listed = str(caught.value).partition("methods ")[2].rstrip(".").split(", ")
+            assert listed == [other for other, fit in METHODS.items() if fit.fits(sizes)]
+            assert "random" in listed and name not in listed
 
 
 NUM_STATES, DISCOUNT = 6, 0.8
@@ -150,7 +164,7 @@ def test_ddqn_learns_a_short_chain():
         model_free=ModelFreeConfig(updates_per_round=2),
         ddqn=DDQNConfig(hidden=(64,), lr=3e-3, discount=DISCOUNT, target_every=20, epsilon_end=0.3, epsilon_steps=1000),
     )
-    explorer = make_explorer(METHODS["ddqn"], Sizes(NUM_STATES, 2, discrete=True, one_hot_obs=True), config)
+    explorer = make_explorer(METHODS["ddqn"], Sizes(NUM_STATES, 2, True, True, True), config)
     after, reward = (jnp.asarray(x) for x in move(np.arange(NUM_STATES)[:, None], np.arange(2)[None]))
     see = lambda state: jax.nn.one_hot(state, NUM_STATES)  # noqa: E731
 
