@@ -6,6 +6,7 @@ from typing import Any
 from jaxplore.behaviours import ImaginationConfig
 from jaxplore.beliefs import FitConfig
 from jaxplore.dynamics import DynamicsConfig
+from jaxplore.gradient_policy import GradientPolicyConfig
 from jaxplore.mcts import MCTSConfig
 from jaxplore.methods import ExplorationConfig
 from jaxplore.sac import SACConfig
@@ -29,6 +30,9 @@ LAPTOP = ExplorationConfig(
         normalize_reward=True,
     ),
     sac=SACConfig(hidden=(128, 128), batch_size=256, log_std_min=-5.0),
+    gradient=GradientPolicyConfig(
+        updates=100, batch_size=64, hidden=(128, 128), restart=False, normalize_reward=True, bound=10.0
+    ),
 )
 """Settings for a laptop without a GPU: see `results/ant_maze_laptop/TUNING.md` for what was tried."""
 
@@ -40,6 +44,8 @@ SMOKE = dataclasses.replace(
         LAPTOP.imagination, horizon=10, num_actors=32, num_rollouts=1, updates_per_rollout=20
     ),
     sac=dataclasses.replace(LAPTOP.sac, hidden=(32, 32), batch_size=64),
+    gradient=dataclasses.replace(LAPTOP.gradient, updates=5, hidden=(32, 32)),
+    task_sac=dataclasses.replace(LAPTOP.task_sac, hidden=(32, 32), batch_size=64),
 )
 """The laptop's settings cut down until nothing can be learned: it shows that everything runs."""
 
@@ -63,8 +69,8 @@ NCHAIN_LAPTOP = dataclasses.replace(
     mcts=MCTSConfig(num_iterations=50, num_trajectories=100),
 )
 """Small networks, and as many gradient steps at the end of a run as at its start. More trajectories than the paper's:
-once the models are sure of a long stretch, few random ones of 49 steps reach what lies beyond it, and with no utility in
-sight the search walks at random."""
+once the models are sure of a long stretch, few random ones of 49 steps reach what lies beyond it, and with no utility
+in sight the search walks at random."""
 
 NCHAIN_SMOKE = dataclasses.replace(
     NCHAIN_LAPTOP,
