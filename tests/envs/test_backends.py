@@ -32,7 +32,7 @@ def test_closed_form(make_bead, backend):
         np.testing.assert_allclose(transition.next_obs, [x, v], atol=1e-6)
         np.testing.assert_allclose(transition.reward, v - 0.5 * push, atol=1e-6)
     assert (env.backend, env.compiled) == (backend, backend == "mjx")
-    assert (env.view.cameras, env.view.needs_renderer) == ((), True)
+    assert (env.view.cameras, env.view.needs_renderer) == (("free",), True)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
