@@ -22,13 +22,23 @@ ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
 }
 """Activations by name. `leaky_relu` has slope 0.01; `swish` is x * sigmoid(x)."""
 
+
+def _small_uniform() -> Callable[..., Array]:
+    return lambda key, shape, dtype=jnp.float32: jax.random.uniform(key, shape, dtype, -3e-3, 3e-3)
+
+
 INITIALIZERS = {
     "he": nn.initializers.he_normal,
     "lecun": nn.initializers.lecun_normal,
     "orthogonal": nn.initializers.orthogonal,
+    "orthogonal_relu": lambda: nn.initializers.orthogonal(2.0**0.5),
+    "orthogonal_small": lambda: nn.initializers.orthogonal(0.01),
+    "small_uniform": _small_uniform,
     "xavier": nn.initializers.xavier_uniform,
+    "xavier_normal": nn.initializers.xavier_normal,
 }
-"""Kernel initialisers by name; biases start at 0."""
+"""Kernel initialisers by name; biases start at 0. `orthogonal_relu` has gain sqrt(2), which keeps the size of what ReLU
+lets through, `orthogonal_small` 0.01; `small_uniform` is within 0.003."""
 
 
 class MLP(nn.Module):
@@ -52,6 +62,8 @@ class MLP(nn.Module):
     """Initialiser of the hidden layers."""
     output_init_name: str = "lecun"
     """Initialiser of the last layer, which no activation follows."""
+    layer_norm: bool = False
+    """Whether hidden layers are normalised (Ba et al. 2016) before their activation."""
 
     def __post_init__(self) -> None:
         validate.one_of("activation", self.activation, ACTIVATIONS)
@@ -64,6 +76,8 @@ class MLP(nn.Module):
         """Run the network."""
         for i, width in enumerate(self.hidden):
             x = nn.Dense(width, kernel_init=INITIALIZERS[self.init_name](), name=f"hidden_{i}")(x)
+            if self.layer_norm:
+                x = nn.LayerNorm(name=f"norm_{i}")(x)
             x = ACTIVATIONS[self.activation](x)
         return nn.Dense(self.output_size, kernel_init=INITIALIZERS[self.output_init_name](), name="output")(x)
 

@@ -1,7 +1,8 @@
 """Soft actor-critic in its first form: a policy, two action-value networks, a value network and its slow copy.
 
 Haarnoja et al. (2018), arXiv 1801.01290, with the settings that Ratzlaff et al. (2020) use for exploration (table
-"List of SAC hyper-parameters", after nnaisense/max): fixed entropy weight alpha, leaky ReLU, orthogonal weights.
+"List of SAC hyper-parameters", after nnaisense/max): fixed entropy weight alpha, leaky ReLU, orthogonal weights. As an
+option alpha is learned, as in its second form (Haarnoja et al. 2018b, arXiv 1812.05905); the value network stays.
 Pure functions; the caller normalises observations.
 """
 
@@ -43,6 +44,11 @@ class SACConfig:
     """Transitions per update. Paper: 4096."""
     alpha: float = 0.02
     """Weight of the entropy beside the reward. Paper: 0.02."""
+    learn_alpha: bool = False
+    """Whether the weight is learned, from `alpha` on, so that the entropy becomes `target_entropy` (Haarnoja et al.
+    2018b, arXiv 1812.05905, equation 18). Paper: no."""
+    target_entropy: float = -1.0
+    """The entropy aimed at, nats per action entry. Haarnoja et al. (2018b): -1."""
     discount: float = 0.99
     """gamma per step. Paper: 0.99."""
     tau: float = 5e-3
@@ -66,7 +72,8 @@ class SACConfig:
         for field in ("lr", "reward_scale", "grad_clip"):
             checks.in_range(field, 0.0, open_low=True)
         checks.at_least("batch_size", 1)
-        checks.in_range("alpha", 0.0)
+        checks.in_range("alpha", 0.0, open_low=self.learn_alpha)
+        checks.in_range("target_entropy", high=0.6931, open_low=True)
         checks.in_range("discount", 0.0, 1.0)
         checks.in_range("tau", 0.0, 1.0, open_low=True)
         checks.in_range("policy_penalty", 0.0)
@@ -79,7 +86,7 @@ class SACState:
     """What SAC carries."""
 
     params: Params
-    """`{"policy", "q", "v"}`; the leaves of `q` have a leading axis of 2."""
+    """`{"policy", "q", "v"}`; the leaves of `q` have a leading axis of 2. With `learn_alpha` also `"log_alpha"`."""
     target_v: Params
     """Slow copy of the value network."""
     opt_state: optax.OptState
@@ -95,7 +102,7 @@ def make_sac(obs_size: int, action_size: int, config: SACConfig | None = None) -
 
     Returns:
         A `Learner`. The metrics of `update` are `q_loss`, `v_loss`, `policy_loss`, `q` (mean value of the batch) and
-        `entropy` (of the policy on the batch, nats).
+        `entropy` (of the policy on the batch, nats); with `learn_alpha` also `alpha`, after the update.
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -132,6 +139,8 @@ def make_sac(obs_size: int, action_size: int, config: SACConfig | None = None) -
             "q": jax.vmap(lambda one: value.init(one, inputs)["params"])(jax.random.split(q_key, 2)),
             "v": value.init(v_key, obs)["params"],
         }
+        if config.learn_alpha:
+            params["log_alpha"] = jnp.log(jnp.float32(config.alpha))
         return SACState(params, jax.tree.map(jnp.copy, params["v"]), optimizer.init(params))
 
     def actor(state: SACState) -> Params:
@@ -144,18 +153,19 @@ def make_sac(obs_size: int, action_size: int, config: SACConfig | None = None) -
         return tanh_mean(apply_policy(actor, obs))
 
     def loss(params: Params, key: Key, target_v: Params, batch: Transition) -> tuple[Array, Metrics]:
+        alpha = jnp.exp(jax.lax.stop_gradient(params["log_alpha"])) if config.learn_alpha else config.alpha
         gaussian = apply_policy(params["policy"], batch.obs)
         action, log_prob = sample_tanh_gaussian(key, gaussian)
         # The networks share no parameters, so the gradient of the sum is each network's own.
         q_of_policy = jnp.min(apply_q(jax.lax.stop_gradient(params["q"]), batch.obs, action), axis=0)
         penalty = jnp.mean(tanh_mean(gaussian) ** 2) + jnp.mean(gaussian.log_std**2)
-        policy_loss = jnp.mean(config.alpha * log_prob - q_of_policy) + config.policy_penalty * penalty
+        policy_loss = jnp.mean(alpha * log_prob - q_of_policy) + config.policy_penalty * penalty
 
         next_v = apply_v(target_v, batch.next_obs)
         q_target = config.reward_scale * batch.reward + config.discount * jnp.where(batch.terminated, 0.0, next_v)
         q = apply_q(params["q"], batch.obs, batch.action)
         q_loss = 0.5 * jnp.sum(jnp.mean((q - jax.lax.stop_gradient(q_target)[None]) ** 2, axis=1))
-        v_target = jax.lax.stop_gradient(q_of_policy - config.alpha * log_prob)
+        v_target = jax.lax.stop_gradient(q_of_policy - alpha * log_prob)
         v_loss = 0.5 * jnp.mean((apply_v(params["v"], batch.obs) - v_target) ** 2)
         metrics = {
             "q_loss": q_loss,
@@ -164,13 +174,19 @@ def make_sac(obs_size: int, action_size: int, config: SACConfig | None = None) -
             "q": jnp.mean(q),
             "entropy": -jnp.mean(log_prob),
         }
-        return policy_loss + q_loss + v_loss, metrics
+        total = policy_loss + q_loss + v_loss
+        if config.learn_alpha:
+            surplus = -jnp.mean(jax.lax.stop_gradient(log_prob)) - config.target_entropy * action_size
+            total = total + params["log_alpha"] * surplus
+        return total, metrics
 
     def update(key: Key, state: SACState, batch: Transition) -> tuple[SACState, Metrics]:
         gradient, metrics = jax.grad(loss, has_aux=True)(state.params, key, state.target_v, batch)
         steps, opt_state = optimizer.update(gradient, state.opt_state, state.params)
         params: Params = optax.apply_updates(state.params, steps)
         target_v = optax.incremental_update(params["v"], state.target_v, config.tau)
+        if config.learn_alpha:
+            metrics = {**metrics, "alpha": jnp.exp(params["log_alpha"])}
         return SACState(params, target_v, opt_state), metrics
 
     return Learner(init, actor, act, act_greedily, update, config.batch_size)

@@ -244,6 +244,17 @@ def test_entropy_is_worth_alpha_per_nat():
     assert float(jnp.mean(metrics["constant"]["entropy"][-500:])) == pytest.approx(-best.fun, abs=0.02)
 
 
+@pytest.mark.parametrize("start", [0.5, 1e-3])
+def test_a_learned_entropy_weight_settles_where_the_entropy_is_the_target(start):
+    # reward -(a - obs / 2)^2: the policy of weight alpha is close to a Gaussian of variance alpha / 2, with entropy
+    # log(pi e alpha) / 2 nats; it is -1 at alpha = exp(-3) / pi = 0.016, from above and from below
+    _, _, metrics = train(["target_action"], steps=2500, alpha=start, learn_alpha=True)
+    entropy, alpha = (np.asarray(metrics["target_action"][name]) for name in ("entropy", "alpha"))
+    assert alpha[0] == pytest.approx(start, rel=0.01)
+    assert np.mean(entropy[-500:]) == pytest.approx(-1.0, abs=0.1)
+    assert np.mean(alpha[-500:]) == pytest.approx(math.exp(-3) / math.pi, rel=0.3)
+
+
 def test_bad_settings_are_refused():
     # field, value and range
     with pytest.raises(ValueError, match=r"SACConfig\.discount=1\.01 .*\[0, 1\]"):
@@ -252,5 +263,9 @@ def test_bad_settings_are_refused():
         SACConfig(tau=0.0)
     with pytest.raises(ValueError, match=r"SACConfig\.log_std_min=3\.0"):
         SACConfig(log_std_min=3.0)
+    with pytest.raises(ValueError, match=r"SACConfig\.alpha=0\.0 .*\(0, inf"):
+        SACConfig(alpha=0.0, learn_alpha=True)
+    with pytest.raises(ValueError, match=r"SACConfig\.target_entropy=1\.0 "):
+        SACConfig(target_entropy=1.0)
     with pytest.raises(ValueError, match=r"SACConfig\.init='ortogonal' .*Did you mean 'orthogonal'"):
         SACConfig(init="ortogonal")
