@@ -10,10 +10,11 @@ Q is the mean return through a, n_a how often a was tried, n the sum over action
 tree and w = sqrt(2). Without c the bonus would swamp intrinsic rewards, which are far below 1. Actions not yet tried
 come first, ties are random.
 
-Our own rather than `mctx.search`, which takes UCB-1 as a selection function and trajectories as a leaf's value: its tree
-holds mean values only, not the largest return, and it draws random numbers in each simulation, where all can be drawn
-in one call beforehand. With c as the largest *mean* the two agree: over 300 keys on a chain of 40 the root's means are
-0.2926 and 0.1549 here, 0.2922 and 0.1547 there (standard errors 0.0015), in 1.3 and 1.9 ms (mctx 0.0.71, one CPU core).
+Our own rather than `mctx.search`, which takes UCB-1 as a selection function and trajectories as a leaf's value: its
+tree holds mean values only, not the largest return, and it draws random numbers in each simulation, where all can be
+drawn in one call beforehand. With c as the largest *mean* the two agree: over 300 keys on a chain of 40 the root's
+means are 0.2926 and 0.1549 here, 0.2922 and 0.1547 there (standard errors 0.0015), in 1.3 and 1.9 ms (mctx 0.0.71, one
+CPU core).
 """
 
 import math
