@@ -24,7 +24,8 @@ class RunConfig:
     env: str = "ant_maze"
     """Environment to explore: one of ours, or `gymnasium:ID`, `brax:NAME`, `playground:NAME`."""
     method: str = "implicit"
-    """How: `implicit` (the paper's) or `random` (uniform actions)."""
+    """How to explore: a row of the methods table (`jaxplore/methods.py`), such as `implicit` (the paper's), `max`,
+    `disagreement`, `icm` or `random` (uniform actions)."""
     preset: Preset = "laptop"
     """Where the other settings start from: `laptop` (10,000 steps in minutes on 2 CPU cores), `paper` (the paper's
     numbers), `smoke` (under a minute)."""
@@ -63,15 +64,17 @@ class RunConfig:
             )
 
 
-def preset_config(preset: str, env: str = "ant_maze") -> RunConfig:
-    """The configuration that a preset stands for.
+def preset_config(preset: str, env: str = "ant_maze", method: str = "implicit") -> RunConfig:
+    """The configuration that a preset stands for, with the settings that the method departs in.
 
     Raises:
-        ValueError: unknown `preset` or `env`, naming the nearest match.
+        ValueError: unknown `preset`, `env` or `method`, naming the nearest match.
     """
     validate.one_of("preset", preset, PRESETS)
+    validate.one_of("method", method, METHODS)
     envs.check_name(env)
-    return RunConfig(env=env, preset=cast(Preset, preset), **presets.settings(preset, env))
+    config = RunConfig(env=env, method=method, preset=cast(Preset, preset), **presets.settings(preset, env))
+    return dataclasses.replace(config, explorer=METHODS[method].settings(config.explorer))
 
 
 def to_json(config: Any) -> str:
@@ -79,12 +82,13 @@ def to_json(config: Any) -> str:
     return json.dumps(dataclasses.asdict(config), indent=2) + "\n"
 
 
-def from_json(text: str, source: str) -> RunConfig:
-    """A configuration from JSON; fields that are left out keep the defaults of the preset it names.
+def from_json(text: str, source: str, method: str | None = None) -> RunConfig:
+    """A configuration from JSON; fields that are left out keep the defaults of the preset and the method it names.
 
     Args:
         text: JSON, as `to_json` writes it.
         source: where it came from, for messages.
+        method: the method where the text names none.
 
     Raises:
         ValueError: not JSON, an unknown field (naming the nearest match), or a value that a field refuses.
@@ -96,7 +100,9 @@ def from_json(text: str, source: str) -> RunConfig:
     if not isinstance(data, dict):
         raise ValueError(f"{source} holds {type(data).__name__}. Allowed: an object with the fields of a run.")
     try:
-        start = preset_config(data.get("preset", "laptop"), data.get("env", "ant_maze"))
+        start = preset_config(
+            data.get("preset", "laptop"), data.get("env", "ant_maze"), data.get("method", method or "implicit")
+        )
     except ValueError as error:
         raise ValueError(f"{source}: {error}") from error
     return replace(start, data, lambda path: f"{source}: {path}")

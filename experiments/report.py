@@ -13,6 +13,7 @@ from experiments import loop, plot
 from experiments.config import RunConfig
 from experiments.errors import RunError
 from experiments.log import read_metrics, summary
+from jaxplore.methods import get_method, reward_unit
 
 PANELS = 4
 
@@ -66,9 +67,7 @@ def write(config: RunConfig, out: Path, env: Environment) -> str:
         )
     steps, reward = series(rows, "intrinsic_reward")
     files["reward"] = out / "intrinsic_reward.png"
-    unit = "intrinsic reward (normalised delta, squared)"
-    if config.explorer.reward_units == "raw":
-        unit = "intrinsic reward (raw units, squared)"
+    unit = f"intrinsic reward ({reward_unit(get_method(config.method), config.explorer)})"
     plot.plot_intrinsic_reward(files["reward"], [plot.Curves(config.method, steps, reward)], unit=unit, title=title)
     table = summary(rows, size=env.coverage.size, unit=env.coverage.unit, files=files)
     if env.view is not None:

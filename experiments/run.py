@@ -99,15 +99,17 @@ def parse(argv: Sequence[str]) -> tuple[CommandLine, RunConfig]:
         SystemExit: `--help`, or a flag that does not exist.
     """
     out, config_path = _option(argv, "out"), _option(argv, "config")
-    preset, env = _option(argv, "preset"), _option(argv, "env")
+    preset, env, method = _option(argv, "preset"), _option(argv, "env"), _option(argv, "method")
     if config_path is None and out and "--resume" in argv and os.path.exists(Path(out) / "config.json"):
         config_path = str(Path(out) / "config.json")
     if config_path is not None:
-        start = _read_config(Path(config_path))
-        if preset is not None and preset != start.preset:
-            raise ValueError(f"--preset={preset} disagrees with {config_path}, which has {start.preset!r}. Give one.")
+        start = _read_config(Path(config_path), method)
+        # Other settings hang on these two, and the file has settled them.
+        for name, given, saved in (("preset", preset, start.preset), ("method", method, start.method)):
+            if given is not None and given != saved:
+                raise ValueError(f"--{name}={given} disagrees with {config_path}, which has {saved!r}. Give one.")
     else:
-        start = preset_config(preset or "laptop", env or "ant_maze")
+        start = preset_config(preset or "laptop", env or "ant_maze", method or "implicit")
     command, changes = flags.parse(
         argv,
         (CommandLine(), start),
@@ -168,9 +170,9 @@ def choose_directory(command: CommandLine, config: RunConfig) -> Path:
     return out
 
 
-def _read_config(path: Path) -> RunConfig:
+def _read_config(path: Path, method: str | None = None) -> RunConfig:
     try:
-        return from_json(path.read_text(), str(path))
+        return from_json(path.read_text(), str(path), method)
     except (OSError, UnicodeDecodeError) as error:
         raise RunError(f"cannot read the configuration {path}: {error}.") from error
 

@@ -104,6 +104,11 @@ class ImaginationConfig:
                 f"Allowed: at least num_actors * horizon = {self.num_actors * self.horizon}."
             )
 
+    @property
+    def num_updates(self) -> int:
+        """Updates of the policy in a round, on real and on imagined data."""
+        return self.real_updates + max(0, self.num_rollouts - self.num_random_rollouts) * self.updates_per_rollout
+
 
 @struct.dataclass
 class ImaginationState:
@@ -148,49 +153,6 @@ def make_imagination(
             learner.init(key), replay.init(example, config.replay_capacity), jnp.zeros((), jnp.int32)
         )
 
-    def act(key: Key, actor: Any, normalizers: Normalizers, obs: Array) -> Array:
-        seen = normalizer.normalize(normalizers.obs, obs)
-        return learner.act_greedily(actor, seen) if config.act_greedily else learner.act(key, actor, seen)
-
-    def label(experience: Experience) -> Replay[Transition]:
-        """The real data with the intrinsic reward that the round's models give it."""
-        data, normalizers = experience.data, experience.normalizers
-        capacity = replay.capacity(data)
-
-        def chunk(i: Array, rewards: Array) -> Array:
-            index = jnp.minimum(i * LABEL_CHUNK + jnp.arange(LABEL_CHUNK), capacity - 1)
-            rows = jax.tree.map(lambda leaf: leaf[index], data.rows)
-            prediction = predict(experience.models, encoding.inputs(normalizers, rows.obs, rows.action))
-            delta = encoding.targets(normalizers, rows.obs, rows.next_obs)
-            return rewards.at[index].set(reward(prediction, delta, normalizers))
-
-        num_chunks = (jnp.minimum(experience.num_data, capacity) + LABEL_CHUNK - 1) // LABEL_CHUNK
-        rewards = jax.lax.fori_loop(0, num_chunks, chunk, jnp.zeros(capacity))
-        return dataclasses.replace(data, rows=data.rows._replace(reward=rewards))
-
-    def train(
-        key: Key,
-        state: Any,
-        draw: Callable[[Key], Transition],
-        normalizers: Normalizers,
-        reward_std: Array,
-        num_updates: int | Array,
-        metrics: Metrics,
-    ) -> tuple[Any, Metrics]:
-        """`num_updates` updates, which may be a traced number, on batches that `draw` gives."""
-
-        def one_update(i: Array, carry: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
-            draw_key, update_key = jax.random.split(jax.random.fold_in(key, i))
-            batch = draw(draw_key)
-            batch = batch._replace(
-                obs=normalizer.normalize(normalizers.obs, batch.obs),
-                next_obs=normalizer.normalize(normalizers.obs, batch.next_obs),
-                reward=batch.reward / reward_std,
-            )
-            return learner.update(update_key, carry[0], batch)
-
-        return jax.lax.fori_loop(0, num_updates, one_update, (state, metrics))
-
     def starts(key: Key, experience: Experience) -> Array:
         """Where the actors start, `[N, O]`."""
         num_current = round(config.current_fraction * config.num_actors)
@@ -218,16 +180,13 @@ def make_imagination(
     def improve(key: Key, state: ImaginationState, experience: Experience) -> tuple[ImaginationState, Metrics]:
         init_key, real_key, rollouts_key = jax.random.split(key, 3)
         normalizers = experience.normalizers
-        if config.restart_every == 1:
-            state = init(init_key)
-        elif config.restart_every > 1:
-            due = state.age == config.restart_every
-            state = jax.tree.map(lambda new, old: jnp.where(due, new, old), init(init_key), state)
+        state = renewed(init_key, state, init, config.restart_every)
         needs_real = config.real_updates > 0 or config.real_fraction > 0
-        real = label(experience) if needs_real else experience.data
+        real = label(belief, reward, experience) if needs_real else experience.data
         learner_state, metrics = state.learner, _no_metrics(learner, obs_size, action_size)
         if config.real_updates > 0:
             learner_state, metrics = train(
+                learner,
                 real_key,
                 learner_state,
                 lambda draw_key: replay.sample(draw_key, real, learner.batch_size),
@@ -264,6 +223,7 @@ def make_imagination(
             finite = jnp.isfinite(rows.reward) & jnp.all(jnp.isfinite(rows.next_obs), axis=-1)
             imagined = replay.add(imagined, rows, finite)
             learner_state, metrics = train(
+                learner,
                 train_key,
                 learner_state,
                 mixed_draw(imagined, real),
@@ -287,7 +247,145 @@ def make_imagination(
         )
         return ImaginationState(learner_state, imagined, state.age + 1), {**metrics, **seen}
 
-    return Behaviour(init, improve, lambda state: learner.actor(state.learner), act)
+    return Behaviour(init, improve, lambda state: learner.actor(state.learner), make_act(learner, config))
+
+
+@struct.dataclass
+class ReactiveState:
+    """What a policy trained on re-labelled real transitions carries."""
+
+    learner: Any
+    age: Array
+    """Rounds that the policy has lived through, int32."""
+
+
+def make_reactive(
+    belief: Belief,
+    reward: Reward,
+    learner: Learner,
+    obs_size: int,
+    action_size: int,
+    config: ImaginationConfig,
+    num_updates: int = 0,
+) -> Behaviour:
+    """Train a learner on real transitions alone, with the intrinsic reward that the round's models give them.
+
+    The reactive mode of nnaisense/max: novelty is looked for where the agent has been, nothing is imagined. As models
+    have just been fitted to the same transitions, an error is small where the fit is good, not only where nothing is
+    new.
+
+    Args:
+        belief: whose models label the data; it must predict.
+        reward: the intrinsic reward.
+        learner: such as `make_sac` gives; it sees normalised observations.
+        obs_size: `O`.
+        action_size: `A`.
+        config: of it count `num_models`, `restart_every`, `normalize_reward` and `act_greedily`.
+        num_updates: updates in each round. 0: as many as `config` comes to for a behaviour that imagines.
+
+    Returns:
+        A `Behaviour`. The metrics are the learner's, from the last update.
+
+    Raises:
+        ValueError: the belief does not predict.
+    """
+    if belief.predict is None:
+        raise ValueError("belief predicts nothing, so nothing can be labelled. Allowed: a belief with `predict`.")
+
+    def init(key: Key) -> ReactiveState:
+        return ReactiveState(learner.init(key), jnp.zeros((), jnp.int32))
+
+    def improve(key: Key, state: ReactiveState, experience: Experience) -> tuple[ReactiveState, Metrics]:
+        init_key, train_key = jax.random.split(key)
+        state = renewed(init_key, state, init, config.restart_every)
+        real = label(belief, reward, experience)
+        learner_state, metrics = train(
+            learner,
+            train_key,
+            state.learner,
+            lambda draw_key: replay.sample(draw_key, real, learner.batch_size),
+            experience.normalizers,
+            _reward_std(real, config.normalize_reward),
+            num_updates or config.num_updates,
+            _no_metrics(learner, obs_size, action_size),
+        )
+        return ReactiveState(learner_state, state.age + 1), metrics
+
+    return Behaviour(init, improve, lambda state: learner.actor(state.learner), make_act(learner, config))
+
+
+def make_act(learner: Learner, config: ImaginationConfig) -> Callable[[Key, Any, Normalizers, Array], Array]:
+    """`Behaviour.act` of a learner that sees normalised observations."""
+
+    def act(key: Key, actor: Any, normalizers: Normalizers, obs: Array) -> Array:
+        seen = normalizer.normalize(normalizers.obs, obs)
+        return learner.act_greedily(actor, seen) if config.act_greedily else learner.act(key, actor, seen)
+
+    return act
+
+
+def renewed(key: Key, state: Any, init: Callable[[Key], Any], restart_every: int) -> Any:
+    """`state`, or a new one from `init` when its `age` is `restart_every` rounds. 0: it lives for good."""
+    if restart_every == 0:
+        return state
+    if restart_every == 1:
+        return init(key)
+    due = state.age == restart_every
+    return jax.tree.map(lambda new, old: jnp.where(due, new, old), init(key), state)
+
+
+def label(belief: Belief, reward: Reward, experience: Experience) -> Replay[Transition]:
+    """The real data with the intrinsic reward that the round's models give it.
+
+    Args:
+        belief: it must predict.
+        reward: the intrinsic reward.
+        experience: models and data. Rows that the data do not hold get 0.
+
+    Returns:
+        The data, `reward` replaced.
+    """
+    data, normalizers, predict = experience.data, experience.normalizers, belief.predict
+    assert predict is not None  # Whoever makes a behaviour refuses a belief that does not.
+    capacity = replay.capacity(data)
+
+    def chunk(i: Array, rewards: Array) -> Array:
+        place = i * LABEL_CHUNK + jnp.arange(LABEL_CHUNK)
+        # The last chunk is filled up with rows already seen: a reward may compare rows, and empty ones are no data.
+        rows = jax.tree.map(lambda leaf: leaf[place % jnp.maximum(data.size, 1)], data.rows)
+        prediction = predict(experience.models, belief.encoding.inputs(normalizers, rows.obs, rows.action))
+        delta = belief.encoding.targets(normalizers, rows.obs, rows.next_obs)
+        given = reward(prediction, delta, normalizers)
+        return rewards.at[jnp.where(place < data.size, place, capacity)].set(given, mode="drop")
+
+    num_chunks = (jnp.minimum(experience.num_data, capacity) + LABEL_CHUNK - 1) // LABEL_CHUNK
+    rewards = jax.lax.fori_loop(0, num_chunks, chunk, jnp.zeros(capacity))
+    return dataclasses.replace(data, rows=data.rows._replace(reward=rewards))
+
+
+def train(
+    learner: Learner,
+    key: Key,
+    state: Any,
+    draw: Callable[[Key], Transition],
+    normalizers: Normalizers,
+    reward_std: Array,
+    num_updates: int | Array,
+    metrics: Metrics,
+) -> tuple[Any, Metrics]:
+    """`num_updates` updates, which may be a traced number, on batches that `draw` gives, observations normalised."""
+
+    def one_update(i: Array, carry: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
+        draw_key, update_key = jax.random.split(jax.random.fold_in(key, i))
+        batch = draw(draw_key)
+        batch = batch._replace(
+            obs=normalizer.normalize(normalizers.obs, batch.obs),
+            next_obs=normalizer.normalize(normalizers.obs, batch.next_obs),
+            reward=batch.reward / reward_std,
+        )
+        return learner.update(update_key, carry[0], batch)
+
+    return jax.lax.fori_loop(0, num_updates, one_update, (state, metrics))
 
 
 @dataclass(frozen=True)

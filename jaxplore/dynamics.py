@@ -24,6 +24,9 @@ from jaxplore.validate import Checks
 
 Target: TypeAlias = Literal["delta", "one_hot"]
 
+LOG_VAR_BOUNDS = (-5.0, -1.0)
+"""Within which a Gaussian network states the log of its variance, in normalised-delta units. nnaisense/max: -5, -1."""
+
 
 @dataclass(frozen=True)
 class DynamicsConfig:

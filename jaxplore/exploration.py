@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxplore import dynamics, replay
+from jaxplore import dynamics, replay, rewards
 from jaxplore.behaviours import Experience, uniform_actions
 from jaxplore.dynamics import Normalizers
-from jaxplore.methods import ExplorationConfig, Method, Sizes, check_fits
+from jaxplore.methods import ExplorationConfig, Method, Sizes, check_fits, divergence_reward
 from jaxplore.replay import Replay
 from jaxplore.types import Array, Key, Metrics, Transition
 
@@ -50,9 +50,11 @@ class Explorer(NamedTuple):
     how long the fit is and must be the same for all seeds under `vmap`, or each takes as long as the longest."""
     assess: Callable[[Key, ExplorerState, Transition, Array], Metrics]
     """`assess(key, state, transitions [T, ...], valid [T]) -> metrics`: what the belief makes of transitions it has
-    not seen. `intrinsic_reward` and `intrinsic_reward_p95` in the reward's units, `model_error` (mean squared error of
-    the models' mean, per normalised-delta entry, where 1 is as good as predicting the mean change; or per
-    probability)."""
+    not seen. `intrinsic_reward` in the reward's own units; so that methods can be compared, of every belief also the
+    `variance` of its models (equation 1, in units of normalised delta or probability) and their `divergence`
+    (Jensen-Renyi, of probabilities Jensen-Shannon, in nats); of each the mean, and with `_p95` the 95th percentile. And
+    `model_error`, the mean squared error of the models' mean, per normalised-delta entry, where 1 is as good as
+    predicting the mean change; or per probability."""
 
 
 def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Explorer:
@@ -87,6 +89,7 @@ def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Ex
     belief = method.belief(sizes, config)
     reward = method.reward(config)
     behaviour = method.behaviour(sizes, config, belief, reward)
+    divergence = divergence_reward(config)
     flag = jnp.zeros((), bool)
     example = Transition(jnp.zeros(sizes.obs), jnp.zeros(sizes.action), jnp.zeros(()), jnp.zeros(sizes.obs), flag, flag)
 
@@ -142,15 +145,24 @@ def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Ex
         if belief.predict is None:
             return {}
         models = belief.sample(key, state.belief, config.imagination.num_models)
-        inputs = belief.encoding.inputs(state.normalizers, transitions.obs, transitions.action)
-        delta = belief.encoding.targets(state.normalizers, transitions.obs, transitions.next_obs)
+        # Valid rows take the others' places: a reward may compare rows.
+        count = jnp.sum(valid)
+        order = jnp.argsort(~valid)[jnp.arange(valid.shape[0]) % jnp.maximum(count, 1)]
+        rows = jax.tree.map(lambda leaf: leaf[order], transitions)
+        counts = jnp.arange(valid.shape[0]) < count
+        inputs = belief.encoding.inputs(state.normalizers, rows.obs, rows.action)
+        delta = belief.encoding.targets(state.normalizers, rows.obs, rows.next_obs)
         prediction = belief.predict(models, inputs)
-        rewards = jnp.where(valid, reward(prediction, delta, state.normalizers), jnp.nan)
-        errors = jnp.mean((jnp.mean(prediction.mean, axis=0) - delta) ** 2, axis=-1)
-        return {
-            "intrinsic_reward": jnp.nanmean(rewards),
-            "intrinsic_reward_p95": jnp.nanpercentile(rewards, 95.0),
-            "model_error": jnp.nanmean(jnp.where(valid, errors, jnp.nan)),
+        of_each = {
+            "intrinsic_reward": reward(prediction, delta, state.normalizers),
+            "variance": rewards.variance(prediction),
+            "divergence": divergence(prediction, delta, state.normalizers),
         }
+        metrics = {}
+        for name, values in of_each.items():
+            held = jnp.where(counts, values, jnp.nan)
+            metrics |= {name: jnp.nanmean(held), f"{name}_p95": jnp.nanpercentile(held, 95.0)}
+        errors = jnp.mean((jnp.mean(prediction.mean, axis=0) - delta) ** 2, axis=-1)
+        return {**metrics, "model_error": jnp.nanmean(jnp.where(counts, errors, jnp.nan))}
 
     return Explorer(init, actor, act, act_uniformly, observe, improve, assess)

@@ -34,7 +34,8 @@ def rollout(
     """Imagine what a policy would meet.
 
     Every model predicts every actor at every step: the reward is read off all of them, and one of them (or their
-    mean) says where the actor goes. Nothing terminates in imagination.
+    mean) says where the actor goes; one that states a variance is drawn from, as in nnaisense/max. Nothing terminates
+    in imagination.
 
     Args:
         key: consumed.
@@ -79,6 +80,9 @@ def rollout(
         else:
             chosen = members if mover == "per_rollout" else jax.random.randint(mover_key, (num_actors,), 0, num_models)
             delta = prediction.mean[chosen, jnp.arange(num_actors)]
+            if prediction.var is not None:
+                std = jnp.sqrt(prediction.var[chosen, jnp.arange(num_actors)])
+                delta = delta + std * jax.random.normal(jax.random.fold_in(mover_key, 1), delta.shape)
         if bound:
             delta = jnp.clip(delta, -bound, bound)
         next_obs = encoding.next_obs(normalizers, obs, delta)

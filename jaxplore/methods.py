@@ -20,6 +20,8 @@ from jaxplore.gradient_policy import GradientPolicyConfig, make_gradient_policy
 from jaxplore.imagination import Reward
 from jaxplore.learner import Learner
 from jaxplore.mcts import MCTSConfig
+from jaxplore.ppo import PPOConfig
+from jaxplore.rnd import RNDConfig, make_rnd_learner, make_rnd_ppo
 from jaxplore.sac import SACConfig, make_sac
 from jaxplore.svgd import SVGDConfig
 from jaxplore.types import Array
@@ -77,12 +79,14 @@ class ExplorationConfig:
     imagination: ImaginationConfig = field(default_factory=ImaginationConfig)
     sac: SACConfig = field(default_factory=SACConfig)
     gradient: GradientPolicyConfig = field(default_factory=GradientPolicyConfig)
+    rnd: RNDConfig = field(default_factory=RNDConfig)
+    ppo: PPOConfig = field(default_factory=PPOConfig)
     mcts: MCTSConfig = field(default_factory=MCTSConfig)
     model_free: ModelFreeConfig = field(default_factory=ModelFreeConfig)
     ddqn: DDQNConfig = field(default_factory=DDQNConfig)
     ddpg: DDPGConfig = field(default_factory=DDPGConfig)
     task_sac: SACConfig = TASK_SAC
-    """SAC on the task's reward; `sac_v2` learns `alpha`, and leaves the reward as it is."""
+    """SAC on the task's reward. `sac_v2` learns `alpha` and leaves the reward as it is."""
 
     def __post_init__(self) -> None:
         checks = Checks(self)
@@ -252,6 +256,29 @@ def reward_gradient(sizes: Sizes, config: ExplorationConfig, belief: Belief, rew
     return make_gradient_policy(belief, reward, sizes.obs, sizes.action, config.gradient)
 
 
+def distillation_with_ppo(sizes: Sizes, config: ExplorationConfig, belief: Belief, reward: Reward) -> Behaviour:
+    """Random network distillation as published: PPO on the real steps of its own policy."""
+    _check_replay_keeps_a_round(config)
+    return make_rnd_ppo(sizes.obs, sizes.action, config.steps_per_round, config.warm_up_steps, config.ppo, config.rnd)
+
+
+def distillation_with_sac(sizes: Sizes, config: ExplorationConfig, belief: Belief, reward: Reward) -> Behaviour:
+    """Random network distillation with SAC on all real transitions, as many updates as other methods have."""
+    _check_replay_keeps_a_round(config)
+    sac, imagination = make_sac(sizes.obs, sizes.action, config.sac), config.imagination
+    num_updates = config.reactive_updates or imagination.num_updates
+    return make_rnd_learner(sac, sizes.obs, config.steps_per_round, imagination, num_updates, config.rnd)
+
+
+def _check_replay_keeps_a_round(config: ExplorationConfig) -> None:
+    """What came last is told by where the replay writes, which must not come round within a round."""
+    if config.data_capacity <= config.steps_per_round:
+        raise ValueError(
+            f"data_capacity={config.data_capacity} holds no more than a round. "
+            f"Allowed: at least steps_per_round + 1 = {config.steps_per_round + 1}."
+        )
+
+
 def uniform_actions(sizes: Sizes, config: ExplorationConfig, belief: Belief, reward: Reward) -> Behaviour:
     """Uniform random actions."""
     return behaviours.make_uniform(sizes.action, sizes.discrete)
@@ -280,10 +307,16 @@ def sac_on_task_reward(sizes: Sizes, config: ExplorationConfig, belief: Belief, 
     return on_task_reward(make_sac(sizes.obs, sizes.action, config.task_sac), sizes, config)
 
 
-def tuned_sac_on_task_reward(sizes: Sizes, config: ExplorationConfig, belief: Belief, reward: Reward) -> Behaviour:
-    """SAC on the environment's own reward, unscaled, with a learned entropy weight."""
-    tuned = dataclasses.replace(config.task_sac, learn_alpha=True, reward_scale=1.0)
-    return on_task_reward(make_sac(sizes.obs, sizes.action, tuned), sizes, config)
+def as_sac_v2(config: ExplorationConfig) -> ExplorationConfig:
+    """SAC's second form: a learned entropy weight, and the reward as it is."""
+    return dataclasses.replace(
+        config, task_sac=dataclasses.replace(config.task_sac, learn_alpha=True, reward_scale=1.0)
+    )
+
+
+def as_baselines_default(config: ExplorationConfig) -> ExplorationConfig:
+    """DDPG's networks as openai/baselines has them where nothing is set, so perhaps as the paper ran them."""
+    return dataclasses.replace(config, ddpg=dataclasses.replace(config.ddpg, layer_norm=False, activation="tanh"))
 
 
 def as_max(config: ExplorationConfig) -> ExplorationConfig:
@@ -376,6 +409,27 @@ METHODS: dict[str, Method] = {
         sac_in_imagination,
         actions="continuous",
     ),
+    "disagreement_grad": Method(
+        "static networks, variance reward, policy by the reward's own gradient through the models",
+        static_belief,
+        variance_reward,
+        reward_gradient,
+        actions="continuous",
+    ),
+    "rnd": Method(
+        "random network distillation with PPO, as published",
+        no_belief,
+        no_reward,
+        distillation_with_ppo,
+        actions="continuous",
+    ),
+    "rnd_sac": Method(
+        "random network distillation with SAC on real transitions, as an ablation",
+        no_belief,
+        no_reward,
+        distillation_with_sac,
+        actions="continuous",
+    ),
     "ddqn": Method(
         "double DQN with epsilon-greedy actions on the environment's own reward, for discrete actions",
         no_belief,
@@ -392,6 +446,15 @@ METHODS: dict[str, Method] = {
         needs_reward=True,
         actions="continuous",
     ),
+    "psne_no_norm": Method(
+        "psne without layer normalisation, as an ablation",
+        no_belief,
+        no_reward,
+        ddpg_on_task_reward,
+        needs_reward=True,
+        actions="continuous",
+        settings=as_baselines_default,
+    ),
     "sac": Method(
         "SAC with a fixed entropy weight on the environment's own reward",
         no_belief,
@@ -404,9 +467,10 @@ METHODS: dict[str, Method] = {
         "SAC with a learned entropy weight on the environment's own reward",
         no_belief,
         no_reward,
-        tuned_sac_on_task_reward,
+        sac_on_task_reward,
         needs_reward=True,
         actions="continuous",
+        settings=as_sac_v2,
     ),
     "random": Method("uniform random actions", no_belief, no_reward, uniform_actions),
 }
@@ -434,6 +498,19 @@ def check_fits(method: Method, sizes: Sizes) -> None:
         f"{name} takes actions that are {wanted}; here an action is {given}. "
         f"Allowed: an environment with {method.actions} actions, or one of the methods {fitting}."
     )
+
+
+def reward_unit(method: Method, config: ExplorationConfig) -> str:
+    """The unit of a method's intrinsic reward, for labels."""
+    probabilities = config.dynamics.target == "one_hot"
+    squared = "probability, squared" if probabilities else "normalised delta, squared"
+    units: dict[object, str] = {
+        variance_reward: "raw units, squared" if config.reward_units == "raw" else squared,
+        divergence_reward: "nats",
+        error_reward: squared if probabilities or config.error_units == "delta" else "std of the observation, squared",
+        spread_reward: "normalised delta",
+    }
+    return units.get(method.reward, "its own units")
 
 
 def get_method(name: str) -> Method:

@@ -1,13 +1,19 @@
 """Intrinsic rewards, read off what m networks predict.
 
-Each takes a `Prediction` with `[M, N, O]` means, in normalised-delta units, and gives one reward per transition,
-`[N]`. They know nothing of where the networks came from.
+Each takes a `Prediction` with `[M, N, O]` means, in normalised-delta units, or the change that happened, and gives one
+reward per transition, `[N]`. They know nothing of where the networks came from.
 """
 
+import math
+
+import jax
 import jax.numpy as jnp
 
-from jaxplore.dynamics import Prediction
+from jaxplore.dynamics import LOG_VAR_BOUNDS, Prediction
 from jaxplore.types import Array
+
+MIN_VAR, MAX_VAR = math.exp(LOG_VAR_BOUNDS[0]), math.exp(LOG_VAR_BOUNDS[1])
+"""Smallest and largest variance that a Gaussian network states, per squared unit of normalised delta."""
 
 
 def variance(prediction: Prediction, delta_std: Array | None = None) -> Array:
@@ -32,3 +38,113 @@ def variance(prediction: Prediction, delta_std: Array | None = None) -> Array:
     if delta_std is not None:
         spread = spread * delta_std[None, :] ** 2
     return jnp.sum(spread, axis=-1)
+
+
+def jensen_renyi(prediction: Prediction, decay: float = 0.1) -> Array:
+    """Jensen-Renyi divergence of order 2 between Gaussian predictions (Shyam et al. 2019; nnaisense/max).
+
+    The entropy of the mixture of all m Gaussians less their mean entropy, both Renyi's of order 2, in nats:
+
+        -log (1/m^2) sum_ij N(f_i - f_j; 0, V_i + V_j)  -  (1/m) sum_i (log |4 pi V_i|) / 2
+
+    nnaisense/max first moves each variance v towards the largest that a network can state, to
+    `MAX_VAR - decay (MAX_VAR - v)`: with its decay of 0.1 the divergence tells hardly anything but how far the means
+    lie apart, and is about 1.4 times `variance` where that is small.
+
+    Args:
+        prediction: of m models, `[M, N, O]`. Networks that state no variance count as if they stated `MIN_VAR`.
+        decay: in (0, 1]. 1: the variances as they are stated.
+
+    Returns:
+        `[N]`, at most ln m. At least 0 where all models state the same variance; Renyi's entropy of order 2 is not
+        concave, so where variances differ and means do not it falls a little below.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> apart = Prediction(jnp.array([[[0.0]], [[100.0]]]))
+        >>> round(float(jensen_renyi(apart)[0]), 4)  # ln 2
+        0.6931
+    """
+    mean = prediction.mean
+    stated = jnp.full_like(mean, MIN_VAR) if prediction.var is None else prediction.var
+    var = MAX_VAR - decay * (MAX_VAR - stated)
+
+    def log_overlaps(one: tuple[Array, Array]) -> Array:
+        """Of one model with all: log N(f_i - f_j; 0, V_i + V_j) plus O log(4 pi) / 2, `[M, N]`."""
+        total = one[1][None] + var
+        return -0.5 * jnp.sum((one[0][None] - mean) ** 2 / total + jnp.log(0.5 * total), axis=-1)
+
+    # One model at a time: all pairs at once are m times the predictions' memory.
+    overlaps = jax.lax.map(log_overlaps, (mean, var))
+    mixture = 2.0 * math.log(mean.shape[0]) - jax.nn.logsumexp(overlaps, axis=(0, 1))
+    return mixture - 0.5 * jnp.mean(jnp.sum(jnp.log(var), axis=-1), axis=0)
+
+
+def jensen_shannon(prediction: Prediction) -> Array:
+    """Jensen-Shannon divergence between predicted probabilities: what MAX seeks where states are finitely many.
+
+    The entropy of the models' mean less their mean entropy, in nats.
+
+    Args:
+        prediction: of m models; means are probabilities, `[M, N, O]`.
+
+    Returns:
+        `[N]`, in [0, ln m].
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> certain = Prediction(jnp.array([[[1.0, 0.0]], [[0.0, 1.0]]]))
+        >>> round(float(jensen_shannon(certain)[0]), 4)  # ln 2
+        0.6931
+    """
+    entropy = jnp.sum(jax.scipy.special.entr(prediction.mean), axis=-1)
+    mixture = jnp.sum(jax.scipy.special.entr(jnp.mean(prediction.mean, axis=0)), axis=-1)
+    return mixture - jnp.mean(entropy, axis=0)
+
+
+def prediction_error(prediction: Prediction, delta: Array, scale: Array | None = None) -> Array:
+    """How far the models' mean is from what happened: `sum_o (mean_i f_io - delta_o)^2`.
+
+    Only real transitions have something that happened. Against a model's own imagination this is on average the
+    `variance` of the models.
+
+    Args:
+        prediction: of m models, `[M, N, O]`.
+        delta: the change that happened, `[N, O]`, normalised.
+        scale: the length of one unit of normalised delta in the units wanted, `[O]`. nnaisense/max counts in standard
+            deviations of the observation: `delta std / obs std`. By default normalised delta.
+
+    Returns:
+        `[N]`, at least 0.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> prediction = Prediction(jnp.array([[[0.0, 0.0]], [[2.0, 0.0]]]))
+        >>> float(prediction_error(prediction, jnp.array([[0.0, 3.0]]))[0])
+        10.0
+    """
+    error = jnp.mean(prediction.mean, axis=0) - delta
+    if scale is not None:
+        error = error * scale[None]
+    return jnp.sum(error**2, axis=-1)
+
+
+def trajectory_spread(delta: Array) -> Array:
+    """How far apart the changes are that actors side by side met: `sum_o std_n delta_no` (nnaisense/max's TVAX).
+
+    Args:
+        delta: the changes that happened, `[N, O]`, normalised; one row per actor.
+
+    Returns:
+        `[N]`, the same number for every actor: the unbiased standard deviation over actors, summed over entries; 0 for
+        a single actor.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> trajectory_spread(jnp.array([[0.0], [2.0]])).tolist()
+        [1.4142135381698608, 1.4142135381698608]
+    """
+    num_actors = delta.shape[0]
+    if num_actors < 2:
+        return jnp.zeros(num_actors)
+    return jnp.full(num_actors, jnp.sum(jnp.std(delta, axis=0, ddof=1)))

@@ -306,7 +306,8 @@ def test_acting_sees_normalised_observations(greedily):
 
 
 def test_assess_says_what_the_belief_makes_of_new_transitions():
-    # after n = 3 updates: reward 11.25 |obs|^2 + 100 delta_0 over valid rows; the models' mean is 1.5 n obs + tag
+    # after n = 3 updates: reward 11.25 |obs|^2 + 100 delta_0 over valid rows; the models' mean is 1.5 n obs + tag, their
+    # variance 11.25 |obs|^2 and their divergence that of models 0, 3 obs, 6 obs, 9 obs, whatever the reward
     explorer = fake_explorer()
     state, _ = explorer.improve(jax.random.key(0), begin(explorer), OBS, 20)
     rows, valid = transitions(9, seed=2), np.arange(9) < 7
@@ -315,11 +316,12 @@ def test_assess_says_what_the_belief_makes_of_new_transitions():
     obs, delta = normal(state, rows)
     reward = (SPREAD * 9 * np.sum(obs**2, axis=1) + 100 * delta[:, 0])[valid]
     error = ((1.5 * 3 * obs + float(jax.random.normal(key, ())) - delta) ** 2)[valid]
-    want = {
-        "intrinsic_reward": reward.mean(),
-        "intrinsic_reward_p95": np.percentile(reward, 95),
-        "model_error": error.mean(),
-    }
+    variance = (SPREAD * 9 * np.sum(obs**2, axis=1))[valid]
+    means = 3 * np.arange(4)[:, None, None] * obs[None, valid]
+    divergence = np.asarray(rewards.jensen_renyi(Prediction(jnp.asarray(means, jnp.float32)), 0.1))
+    want: dict[str, object] = {"model_error": error.mean()}
+    for name, values in (("intrinsic_reward", reward), ("variance", variance), ("divergence", divergence)):
+        want |= {name: values.mean(), f"{name}_p95": np.percentile(values, 95)}
     assert {name: float(value) for name, value in got.items()} == pytest.approx(want, rel=1e-4)
 
 

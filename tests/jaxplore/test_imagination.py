@@ -110,6 +110,30 @@ def test_a_model_is_drawn_for_each_actor_at_each_step():
     assert np.mean(movers[:, 1:] == movers[:, :-1]) == pytest.approx(1 / 3, abs=0.12)
 
 
+def test_models_that_state_a_variance_are_drawn_from():
+    # one model, 4,000 actors, 1 step: changes have the model's mean and the variance it states, entry by entry; the
+    # mean of models is not drawn from
+    var = np.array([0.04, 0.25], np.float32)
+
+    def stating(models, inputs):
+        mean = predict(models, inputs).mean
+        return Prediction(mean, jnp.broadcast_to(jnp.asarray(var), mean.shape))
+
+    def changes(mover):
+        start = jnp.tile(jnp.asarray(START[:1]), (4_000, 1))
+        args = (jnp.asarray(MODELS[:1]), NORMALIZERS, start, 1, mover)
+        rows = rollout(jax.random.key(0), act, stating, lambda prediction, delta, _: delta[:, 1], *args)
+        return (rows.next_obs[0] - start - MEANS["delta"][None]) / STDS["delta"][None], rows.reward[0]
+
+    want = by_hand(START[0], np.tanh(START[0] @ GAIN))[0][0]
+    for mover in ("per_step", "per_rollout"):
+        drawn, told = changes(mover)
+        np.testing.assert_allclose(np.mean(drawn, axis=0), want, atol=4 * 0.5 / np.sqrt(4_000))
+        np.testing.assert_allclose(np.var(drawn, axis=0), var, rtol=0.1)
+        np.testing.assert_allclose(told, drawn[:, 1], atol=1e-4)  # The reward is told of the change that was drawn.
+    np.testing.assert_allclose(changes("mean")[0], np.tile(want, (4_000, 1)), atol=1e-4)
+
+
 @pytest.mark.parametrize("mover", ["per_step", "per_rollout", "mean"])
 def test_reward_sees_all_models_and_the_delta_that_happened(mover):
     # recomputed from the rows: predictions of all models at (obs, action), and the actor's own change

@@ -1,0 +1,212 @@
+"""The methods that the paper compares with: what each is put together from, and policies that imagine nothing."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxplore import dynamics, replay, rewards
+from jaxplore.behaviours import LABEL_CHUNK, Experience, ImaginationConfig, label, make_reactive
+from jaxplore.beliefs import Belief, make_no_belief
+from jaxplore.dynamics import DynamicsConfig, Prediction
+from jaxplore.exploration import make_explorer
+from jaxplore.learner import Learner
+from jaxplore.methods import METHODS, ExplorationConfig, Sizes
+from jaxplore.sac import SACConfig
+from jaxplore.types import Transition
+
+O, A, M = 3, 2, 4  # noqa: E741
+SIZES, CHAIN = Sizes(O, A), Sizes(6, 2, discrete=True, one_hot_obs=True)
+TINY = ImaginationConfig(
+    num_models=M,
+    num_actors=4,
+    horizon=3,
+    num_rollouts=3,
+    num_random_rollouts=1,
+    updates_per_rollout=2,
+    real_updates=1,
+    replay_capacity=64,
+)
+SMALL = ExplorationConfig(
+    data_capacity=64,
+    dynamics=DynamicsConfig(hidden=(8,)),
+    imagination=TINY,
+    sac=SACConfig(hidden=(8, 8), batch_size=8),
+)
+
+
+def real_data(num, capacity=64):
+    """`Experience` of `num` random transitions, its models the numbers 0, 1, 2, 3."""
+    rng = np.random.default_rng(0)
+    obs = rng.normal(size=(num, O)) + 1
+    rows = (obs, rng.uniform(-1, 1, (num, A)), np.full(num, 7.0), obs + rng.normal(size=(num, O)))
+    flag = jnp.zeros(num, bool)
+    rows = Transition(*(jnp.asarray(x, jnp.float32) for x in rows), flag, flag)
+    data = replay.add(replay.init(jax.tree.map(lambda leaf: leaf[0], rows), capacity), rows)
+    normalizers = dynamics.update_normalizers(dynamics.init_normalizers(O, A), rows, jnp.ones(num, bool))
+    return Experience(jnp.arange(float(M)), data, jnp.int32(num), normalizers, rows.obs[0])
+
+
+BELIEF = Belief(
+    init=lambda key: (),
+    update=lambda key, state, data, normalizers: (state, {}),
+    sample=lambda key, state, num: jnp.arange(float(num)),
+    predict=lambda models, inputs: Prediction(models[:, None, None] * inputs[None, :, :O]),
+)
+"""Models that predict 0, 1, 2 and 3 times the normalised observation: variance 1.25 |obs|^2."""
+
+
+def recorder(batch_size):
+    """A learner that keeps its last batch and counts its updates."""
+    flag = jnp.zeros(batch_size, bool)
+    rows = [jnp.zeros((batch_size, size)) for size in (O, A)]
+    empty = Transition(rows[0], rows[1], jnp.zeros(batch_size), rows[0], flag, flag)
+    return Learner(
+        init=lambda key: {"updates": jnp.zeros((), jnp.int32), "batch": empty},
+        actor=lambda state: state["updates"],
+        act=lambda key, actor, obs: 5.0 + obs[..., :A],
+        act_greedily=lambda actor, obs: obs[..., :A],
+        update=lambda key, state, batch: ({"updates": state["updates"] + 1, "batch": batch}, {"one": jnp.ones(())}),
+        batch_size=batch_size,
+    )
+
+
+def variance(prediction, delta, normalizers):
+    return rewards.variance(prediction)
+
+
+@pytest.mark.parametrize(("num_updates", "restart_every", "lives"), [(0, 1, [5, 5, 5]), (7, 2, [7, 14, 7])])
+def test_a_reactive_policy_sees_real_transitions_alone(num_updates, restart_every, lives):
+    # every row of a batch is one of the 20 real ones, normalised, with its reward by today's models in place of the
+    # environment's 7; 1 + 2 x 2 updates unless told, as where rollouts are imagined
+    config = dataclasses.replace(TINY, restart_every=restart_every)
+    behaviour = make_reactive(BELIEF, variance, recorder(16), O, A, config, num_updates)
+    experience = real_data(20)
+    state, improve = behaviour.init(jax.random.key(0)), jax.jit(behaviour.improve)
+    for number, life in enumerate(lives):
+        scale = 1.0 + number
+        state, metrics = improve(
+            jax.random.key(number), state, experience._replace(models=scale * jnp.arange(float(M)))
+        )
+        assert int(state.learner["updates"]) == life and set(metrics) == {"one"}
+        batch, stats = state.learner["batch"], experience.normalizers.obs
+        real = np.asarray((experience.data.rows.obs[:20] - stats.mean[None]) / stats.std[None])
+        gaps = np.max(np.abs(np.asarray(batch.obs)[:, None] - real[None]), axis=-1)
+        assert np.max(np.min(gaps, axis=1)) < 1e-5
+        chosen = np.argmin(gaps, axis=1)
+        np.testing.assert_allclose(batch.action, experience.data.rows.action[chosen], rtol=1e-6)
+        np.testing.assert_allclose(batch.reward, 1.25 * scale**2 * np.sum(real[chosen] ** 2, axis=1), rtol=1e-4)
+        assert len(set(chosen)) > 8
+    # and it carries no room for anything imagined
+    assert all(leaf.shape[:1] in ((), (16,)) for leaf in jax.tree.leaves(state))
+    obs = experience.data.rows.obs[3]
+    action = behaviour.act(jax.random.key(0), behaviour.actor(state), experience.normalizers, obs)
+    np.testing.assert_allclose(action, real[3, :A], rtol=1e-4)
+
+
+@pytest.mark.parametrize("num", [20, LABEL_CHUNK + 10])
+def test_rewards_that_compare_rows_see_held_rows_only(num):
+    # room for 1,500 transitions, mostly empty: the spread is of chunks of real changes, about 1 an entry in normalised
+    # units, where empty rows (a change of 0) would pull it down; rows that are not held have no reward
+    experience = real_data(num, capacity=1_500)
+    got = label(BELIEF, lambda prediction, delta, normalizers: rewards.trajectory_spread(delta), experience).rows.reward
+    np.testing.assert_allclose(got[:num], O, rtol=0.05)
+    np.testing.assert_array_equal(got[num:], 0.0)
+
+
+def test_a_reactive_policy_needs_models():
+    # nothing to label by
+    with pytest.raises(ValueError, match="belief predicts nothing, so nothing can be labelled"):
+        make_reactive(make_no_belief(), variance, recorder(4), O, A, TINY)
+
+
+def test_settings_are_those_of_maxs_commands():
+    # nnaisense/max's README: swish for all; MAX and JDRX alpha 0.02, TVAX and PERX 0.2; JDRX and PERX 100 reactive
+    # updates. On the chain its networks are the others' (tanh there). Methods of the paper's own share every setting
+    default = ExplorationConfig()
+    for name, alpha, updates in (
+        ("max", 0.02, 0),
+        ("max_reactive", 0.02, 100),
+        ("max_trajectory", 0.2, 0),
+        ("prediction_error", 0.2, 100),
+    ):
+        config = METHODS[name].settings(default)
+        assert (config.dynamics.activation, config.sac.alpha, config.reactive_updates) == ("swish", alpha, updates)
+        assert config.renyi_decay == 0.1 and config.fit == default.fit and config.imagination == default.imagination
+    for name in ("implicit", "disagreement", "icm", "icm_active", "random"):
+        assert METHODS[name].settings(default) == default
+    chain = ExplorationConfig(dynamics=DynamicsConfig(activation="tanh", target="one_hot"))
+    assert METHODS["max"].settings(chain) == chain
+
+
+def prediction_of(means, var=None):
+    return Prediction(jnp.asarray(means, jnp.float32), var)
+
+
+def test_rewards_of_the_table():
+    # each row's reward of the same prediction, against the function that it stands for, in the units of the settings
+    means = np.random.default_rng(0).normal(size=(M, 5, O))
+    delta = jnp.asarray(np.random.default_rng(1).normal(size=(5, O)), jnp.float32)
+    experience = real_data(20)
+    stats, prediction = experience.normalizers, prediction_of(means, 0.1 * jnp.ones((M, 5, O)))
+
+    def given(name, prediction=prediction, **settings):
+        return METHODS[name].reward(ExplorationConfig(**settings))(prediction, delta, stats)
+
+    np.testing.assert_array_equal(given("disagreement"), rewards.variance(prediction))
+    for name in ("max", "max_reactive"):
+        np.testing.assert_array_equal(given(name), rewards.jensen_renyi(prediction, 0.1))
+        np.testing.assert_array_equal(given(name, renyi_decay=1.0), rewards.jensen_renyi(prediction, 1.0))
+    np.testing.assert_array_equal(given("max_trajectory"), rewards.trajectory_spread(delta))
+    for name in ("prediction_error", "icm", "icm_active"):
+        error = (means.mean(axis=0) - delta) * stats.delta.std[None] / stats.obs.std[None]
+        np.testing.assert_allclose(given(name), np.sum(error**2, axis=1), rtol=1e-4)
+        plain = rewards.prediction_error(prediction, delta)
+        np.testing.assert_array_equal(given(name, error_units="delta"), plain)
+    chances = prediction_of(jax.nn.softmax(means))
+    got = given("max", prediction=chances, dynamics=DynamicsConfig(target="one_hot"))
+    np.testing.assert_array_equal(got, rewards.jensen_shannon(chances))
+
+
+@pytest.mark.parametrize("name", ["disagreement", "max", "max_reactive", "max_trajectory", "prediction_error"])
+def test_static_beliefs_have_as_many_networks_as_the_settings_say(name):
+    # Gaussian ones for nnaisense/max's methods, deterministic ones for the others and on the chain
+    method = METHODS[name]
+    belief = method.belief(SIZES, method.settings(SMALL))
+    models = jax.eval_shape(lambda key: belief.sample(key, belief.init(key), M), jax.random.key(0))
+    assert models["output"]["kernel"].shape == (M, 8, O if name == "disagreement" else 2 * O)
+    chain = dataclasses.replace(SMALL, dynamics=DynamicsConfig(hidden=(8,), target="one_hot"))
+    belief = method.belief(CHAIN, chain)
+    models = jax.eval_shape(lambda key: belief.sample(key, belief.init(key), M), jax.random.key(0))
+    assert models["output"]["kernel"].shape == (M, 8, CHAIN.obs)
+
+
+@pytest.mark.parametrize("name", ["max_reactive", "max_trajectory", "prediction_error", "icm", "icm_active"])
+def test_what_needs_actions_that_are_numbers_is_refused_on_the_chain(name):
+    # what it needs, what there is, and the methods that fit
+    chain = dataclasses.replace(SMALL, planner="mcts", dynamics=DynamicsConfig(hidden=(8,), target="one_hot"))
+    message = rf"method='{name}' takes actions that are numbers.*one of 2 choices.*methods implicit, disagreement, max,"
+    with pytest.raises(ValueError, match=message):
+        make_explorer(METHODS[name], CHAIN, chain)
+
+
+@pytest.mark.parametrize("name", ["max", "icm"])
+def test_a_round_of_a_baseline(name):
+    # one active, one reactive: models are fitted, the policy moves, and what is told of new transitions has every
+    # method's measure beside its own
+    method = METHODS[name]
+    explorer = make_explorer(method, SIZES, method.settings(SMALL))
+    experience, key = real_data(20), jax.random.key(0)
+    state = explorer.observe(
+        explorer.init(key), jax.tree.map(lambda x: x[:20], experience.data.rows), jnp.ones(20, bool)
+    )
+    after, metrics = jax.jit(explorer.improve)(key, state, experience.obs, jnp.int32(20))
+    assert ("policy/imagined_reward" in metrics) == (name == "max")
+    for part in ("belief", "behaviour"):
+        pairs = zip(jax.tree.leaves(getattr(state, part)), jax.tree.leaves(getattr(after, part)), strict=True)
+        assert any(np.any(np.asarray(a) != np.asarray(b)) for a, b in pairs)
+    told = explorer.assess(key, after, jax.tree.map(lambda x: x[:9], experience.data.rows), jnp.arange(9) != 2)
+    assert {"variance", "divergence", "model_error", "intrinsic_reward_p95"} <= told.keys()
+    assert (float(told["divergence"]) == pytest.approx(float(told["intrinsic_reward"]))) == (name == "max")
