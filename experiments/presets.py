@@ -3,12 +3,14 @@
 import dataclasses
 from typing import Any
 
-from jaxplore.behaviours import ImaginationConfig
+from jaxplore.behaviours import ImaginationConfig, ModelFreeConfig
 from jaxplore.beliefs import FitConfig
 from jaxplore.dynamics import DynamicsConfig
 from jaxplore.gradient_policy import GradientPolicyConfig
 from jaxplore.mcts import MCTSConfig
 from jaxplore.methods import ExplorationConfig
+from jaxplore.ppo import PPOConfig
+from jaxplore.rnd import RNDConfig
 from jaxplore.sac import SACConfig
 from jaxplore.svgd import SVGDConfig
 
@@ -33,6 +35,8 @@ LAPTOP = ExplorationConfig(
     gradient=GradientPolicyConfig(
         updates=100, batch_size=64, hidden=(128, 128), restart=False, normalize_reward=True, bound=10.0
     ),
+    rnd=RNDConfig(hidden=(64, 64), features=64, lr=1e-3),
+    ppo=PPOConfig(hidden=(64, 64), rollout_steps=128, epochs=4, minibatch_size=32),
 )
 """Settings for a laptop without a GPU: see `results/ant_maze_laptop/TUNING.md` for what was tried."""
 
@@ -45,6 +49,8 @@ SMOKE = dataclasses.replace(
     ),
     sac=dataclasses.replace(LAPTOP.sac, hidden=(32, 32), batch_size=64),
     gradient=dataclasses.replace(LAPTOP.gradient, updates=5, hidden=(32, 32)),
+    rnd=dataclasses.replace(LAPTOP.rnd, hidden=(32, 32), features=16),
+    ppo=dataclasses.replace(LAPTOP.ppo, hidden=(32, 32)),
     task_sac=dataclasses.replace(LAPTOP.task_sac, hidden=(32, 32), batch_size=64),
 )
 """The laptop's settings cut down until nothing can be learned: it shows that everything runs."""
@@ -57,6 +63,7 @@ NCHAIN_PAPER = ExplorationConfig(
     svgd=SVGDConfig(num_particles=5),
     fit=FitConfig(lr=1e-4, weight_decay=1e-6, batch_size=32, epochs=10, restart=False),
     imagination=ImaginationConfig(num_models=5),
+    model_free=ModelFreeConfig(updates_per_round=1),
 )
 """The paper's agent for the chain: after every step 10 further epochs, 5 new draws, and a tree search in them. Random
 are the first 3 episodes of 49 steps; batch 32 is ours, as the paper is silent on both."""

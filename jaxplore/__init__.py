@@ -7,13 +7,17 @@ network), `rewards`, `rollout` (imagination), `make_sac`, and `make_explorer`, w
 from jaxplore import rewards
 from jaxplore.behaviours import ImaginationConfig, ModelFreeConfig
 from jaxplore.beliefs import Belief, FitConfig, make_generator_belief
+from jaxplore.ddpg import DDPGConfig, make_ddpg
 from jaxplore.ddqn import DDQNConfig, make_ddqn
 from jaxplore.dynamics import DynamicsConfig, Prediction
 from jaxplore.exploration import Explorer, ExplorerState, make_explorer
 from jaxplore.generator import Generator, GeneratorConfig, make_generator
+from jaxplore.gradient_policy import GradientPolicyConfig, make_gradient_policy
 from jaxplore.imagination import rollout
 from jaxplore.learner import Learner
 from jaxplore.methods import METHODS, ExplorationConfig, Method, Sizes, get_method
+from jaxplore.ppo import PPO, PPOConfig, make_ppo
+from jaxplore.rnd import RNDConfig, make_rnd
 from jaxplore.sac import SACConfig, make_sac
 from jaxplore.svgd import (
     AmortizedSVGD,
@@ -27,8 +31,10 @@ __version__ = "0.1.0"
 
 __all__ = [
     "METHODS",
+    "PPO",
     "AmortizedSVGD",
     "Belief",
+    "DDPGConfig",
     "DDQNConfig",
     "DynamicsConfig",
     "ExplorationConfig",
@@ -37,21 +43,28 @@ __all__ = [
     "FitConfig",
     "Generator",
     "GeneratorConfig",
+    "GradientPolicyConfig",
     "ImaginationConfig",
     "Learner",
     "Method",
     "ModelFreeConfig",
+    "PPOConfig",
     "Prediction",
+    "RNDConfig",
     "SACConfig",
     "SVGDConfig",
     "Sizes",
     "Transition",
     "get_method",
     "make_amortized_svgd",
+    "make_ddpg",
     "make_ddqn",
     "make_explorer",
     "make_generator",
     "make_generator_belief",
+    "make_gradient_policy",
+    "make_ppo",
+    "make_rnd",
     "make_sac",
     "rewards",
     "rollout",

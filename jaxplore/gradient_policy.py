@@ -62,8 +62,8 @@ class GradientPolicyConfig:
     restart: bool = True
     """Whether each round starts from a new policy or goes on with the last one."""
     normalize_reward: bool = False
-    """Whether rewards are divided by their standard deviation over the batch, so that the penalty's weight does not
-    depend on their size."""
+    """Whether rewards are divided by their mean size over the batch, so that the penalty's weight does not depend on
+    it."""
     bound: float = 0.0
     """Standard deviations of the real data that imagined observations and changes stay within. 0: no bound."""
     act_greedily: bool = True
@@ -199,7 +199,7 @@ def make_gradient_policy(
         expected, (rewards, gaussian) = imagined_return(
             key, policy, params, predict, reward, experience.models, experience.normalizers, start, config, encoding
         )
-        scale = jnp.maximum(jnp.std(jax.lax.stop_gradient(rewards)), 1e-6) if config.normalize_reward else 1.0
+        scale = jnp.maximum(jnp.mean(jnp.abs(jax.lax.stop_gradient(rewards))), 1e-6) if config.normalize_reward else 1.0
         metrics = {
             "imagined_return": expected,
             "imagined_reward": jnp.mean(rewards),
