@@ -119,7 +119,9 @@ def make_rnd(obs_size: int, config: RNDConfig | None = None) -> RND:
 
         error, gradient = jax.value_and_grad(loss)(state.predictor)
         steps, opt_state = optimizer.update(gradient, state.opt_state)
-        return RNDState(state.target, optax.apply_updates(state.predictor, steps), opt_state), error
+        after = RNDState(state.target, optax.apply_updates(state.predictor, steps), opt_state)
+        # Without a single row Adam is not to count a step either.
+        return jax.tree.map(lambda new, old: jnp.where(jnp.sum(weights) > 0, new, old), after, state), error
 
     return RND(init, lambda state, obs: distance(state.predictor, state.target, obs), update)
 

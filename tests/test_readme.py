@@ -10,6 +10,7 @@ import pytest
 
 import envs
 import jaxplore
+from jaxplore.methods import METHODS
 
 ROOT = Path(__file__).parent.parent
 FOLDERS = ("jaxplore", "envs", "experiments")
@@ -33,6 +34,25 @@ def test_an_environment_of_your_own_takes_30_lines_and_runs(tmp_path: Path, monk
     last = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])
     assert last["step"] == 600
     assert 4 <= last["cells"] <= 16
+
+
+def test_a_method_of_your_own_takes_25_lines_and_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(METHODS, "furthest", METHODS["random"])
+    code = example("furthest_reward")
+    assert len([line for line in code.splitlines() if line.strip()]) <= 25
+    exec(code, {})
+    (run,) = (tmp_path / "runs").iterdir()
+    assert json.loads((run / "config.json").read_text())["method"] == "furthest"
+    lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    assert lines[-1]["step"] == 600
+    assert lines[-1]["policy/imagined_reward"] > 0
+
+
+def test_every_method_is_in_the_table():
+    (section,) = re.findall(r"\n## Methods\n(.*?)\n## ", README, re.DOTALL)
+    named = re.findall(r"`(\w+)`", "".join(row.split("|")[1] for row in section.splitlines() if row.startswith("| `")))
+    assert sorted(named) == sorted(METHODS)
 
 
 def test_the_python_example_runs_and_its_networks_fit_the_data():
