@@ -103,13 +103,14 @@ def parse(argv: Sequence[str]) -> tuple[CommandLine, RunConfig]:
     if config_path is None and out and "--resume" in argv and os.path.exists(Path(out) / "config.json"):
         config_path = str(Path(out) / "config.json")
     if config_path is not None:
-        start = _read_config(Path(config_path), method)
+        start = _read_config(Path(config_path), method if method in METHODS else None)
         # Other settings hang on these two, and the file has settled them.
         for name, given, saved in (("preset", preset, start.preset), ("method", method, start.method)):
             if given is not None and given != saved:
                 raise ValueError(f"--{name}={given} disagrees with {config_path}, which has {saved!r}. Give one.")
     else:
-        start = preset_config(preset or "laptop", env or "ant_maze", method or "implicit")
+        # One that is not known is refused with the other flags.
+        start = preset_config(preset or "laptop", env or "ant_maze", method if method in METHODS else "implicit")
     command, changes = flags.parse(
         argv,
         (CommandLine(), start),

@@ -10,6 +10,7 @@ from jaxplore.beliefs import Belief, FitConfig, make_generator_belief
 from jaxplore.ddpg import DDPGConfig, make_ddpg
 from jaxplore.ddqn import DDQNConfig, make_ddqn
 from jaxplore.dynamics import DynamicsConfig, Prediction
+from jaxplore.ensemble import EnsembleConfig, make_ensemble_belief
 from jaxplore.exploration import Explorer, ExplorerState, make_explorer
 from jaxplore.generator import Generator, GeneratorConfig, make_generator
 from jaxplore.gradient_policy import GradientPolicyConfig, make_gradient_policy
@@ -37,6 +38,7 @@ __all__ = [
     "DDPGConfig",
     "DDQNConfig",
     "DynamicsConfig",
+    "EnsembleConfig",
     "ExplorationConfig",
     "Explorer",
     "ExplorerState",
@@ -59,6 +61,7 @@ __all__ = [
     "make_amortized_svgd",
     "make_ddpg",
     "make_ddqn",
+    "make_ensemble_belief",
     "make_explorer",
     "make_generator",
     "make_generator_belief",

@@ -223,7 +223,7 @@ def test_help_shows_every_setting_with_its_default(
     for name in ("--out PATH", "--resume ", "--config PATH", "--version "):
         assert name in plain
     assert "--env {acrobot,ant_maze," in plain
-    assert "--method {implicit,random}" in plain
+    assert "--method {implicit," in plain
     assert "--svgd.kernel {rbf,imq}" in plain
     assert "explorer" not in plain
 
@@ -232,7 +232,10 @@ def test_help_shows_every_setting_with_its_default(
     ("words", "message"),
     [
         ("--env=ant_mase", r"env='ant_mase' is not known\. Did you mean 'ant_maze'\? Allowed: acrobot, ant_maze"),
-        ("--method=implict", r"--method='implict' is not known\. Did you mean 'implicit'\? Allowed: .*implicit, .*random"),
+        (
+            "--method=implict",
+            r"--method='implict' is not known\. Did you mean 'implicit'\? Allowed: .*implicit, .*random",
+        ),
         ("--preset=papre", r"preset='papre' is not known\. Did you mean 'paper'\? Allowed: laptop, paper, smoke"),
         ("--backend=mjy", r"backend='mjy' .*Did you mean 'mjx'\? Allowed: auto, mjx, mujoco"),
         ("--svgd.kernel=rbff", r"--svgd\.kernel='rbff' is not known\. Did you mean 'rbf'\? Allowed: imq, rbf"),
@@ -278,6 +281,23 @@ def test_preset_and_configuration_must_agree(tmp_path: Path, capsys: pytest.Capt
     path.write_bytes(b"\xff")
     assert run.main([f"--config={path}"]) == 2
     assert str(path) in capsys.readouterr().err
+    assert everything_in(tmp_path) == ["c.json"]
+
+
+def test_a_method_brings_its_own_settings_and_flags_come_on_top(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    # nnaisense/max's TVAX has alpha 0.2 and swish where all others share 0.02 and ReLU; a file that names a method has
+    # settled them, one that names none has not
+    shared, config = parse("--preset=smoke"), parse("--preset=smoke", "--method=max_trajectory")
+    assert (shared.explorer.sac.alpha, shared.explorer.dynamics.activation) == (0.02, "relu")
+    assert (config.explorer.sac.alpha, config.explorer.dynamics.activation) == (0.2, "swish")
+    assert parse("--preset=smoke", "--method", "max_trajectory", "--sac.alpha=0.5").explorer.sac.alpha == 0.5
+    path = tmp_path / "c.json"
+    path.write_text('{"preset": "smoke", "seed": 3}')
+    assert parse(f"--config={path}", "--method=max_trajectory") == dataclasses.replace(config, seed=3)
+    path.write_text('{"preset": "smoke", "method": "max_trajectory", "explorer": {"sac": {"alpha": 0.5}}}')
+    assert parse(f"--config={path}").explorer.sac.alpha == 0.5
+    assert run.main([f"--config={path}", "--method=random", f"--out={tmp_path / 'run'}"]) == 2
+    assert re.search(r"--method=random disagrees with .*c\.json, which has 'max_trajectory'", capsys.readouterr().err)
     assert everything_in(tmp_path) == ["c.json"]
 
 

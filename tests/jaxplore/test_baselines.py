@@ -197,7 +197,8 @@ def test_a_round_of_a_baseline(name):
     # one active, one reactive: models are fitted, the policy moves, and what is told of new transitions has every
     # method's measure beside its own
     method = METHODS[name]
-    explorer = make_explorer(method, SIZES, method.settings(SMALL))
+    config = dataclasses.replace(SMALL, imagination=dataclasses.replace(TINY, real_updates=0))
+    explorer = make_explorer(method, SIZES, method.settings(config))
     experience, key = real_data(20), jax.random.key(0)
     state = explorer.observe(
         explorer.init(key), jax.tree.map(lambda x: x[:20], experience.data.rows), jnp.ones(20, bool)
@@ -207,6 +208,6 @@ def test_a_round_of_a_baseline(name):
     for part in ("belief", "behaviour"):
         pairs = zip(jax.tree.leaves(getattr(state, part)), jax.tree.leaves(getattr(after, part)), strict=True)
         assert any(np.any(np.asarray(a) != np.asarray(b)) for a, b in pairs)
-    told = explorer.assess(key, after, jax.tree.map(lambda x: x[:9], experience.data.rows), jnp.arange(9) != 2)
+    told = jax.jit(explorer.assess)(key, after, jax.tree.map(lambda x: x[:9], experience.data.rows), jnp.arange(9) != 2)
     assert {"variance", "divergence", "model_error", "intrinsic_reward_p95"} <= told.keys()
     assert (float(told["divergence"]) == pytest.approx(float(told["intrinsic_reward"]))) == (name == "max")
