@@ -306,8 +306,8 @@ def test_acting_sees_normalised_observations(greedily):
 
 
 def test_assess_says_what_the_belief_makes_of_new_transitions():
-    # after n = 3 updates: reward 11.25 |obs|^2 + 100 delta_0 over valid rows; the models' mean is 1.5 n obs + tag, their
-    # variance 11.25 |obs|^2 and their divergence that of models 0, 3 obs, 6 obs, 9 obs, whatever the reward
+    # after n = 3 updates: reward 11.25 |obs|^2 + 100 delta_0 over valid rows; the models' mean is 1.5 n obs + tag,
+    # their variance 11.25 |obs|^2 and their divergence that of models 0, 3 obs, 6 obs, 9 obs, whatever the reward
     explorer = fake_explorer()
     state, _ = explorer.improve(jax.random.key(0), begin(explorer), OBS, 20)
     rows, valid = transitions(9, seed=2), np.arange(9) < 7
