@@ -23,7 +23,7 @@ def load() -> Any:
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "JAXopt is no longer maintained", DeprecationWarning)
-            from mujoco_playground import registry
+            from mujoco_playground import registry  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ValueError(
             f"env='playground:...' needs the package playground ({error}). "
