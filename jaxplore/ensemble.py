@@ -161,6 +161,7 @@ def make_ensemble_belief(
         network = MLP(dynamics_config.hidden, 2 * obs_size, dynamics_config.activation, "xavier", "xavier_normal")
     optimizer = make_optimizer(fit_config)
 
+    @jax.jit
     def init(key: Key) -> EnsembleState:
         def one(key: Key) -> Params:
             return network.init(key, jnp.zeros(obs_size + action_size))["params"]

@@ -12,6 +12,13 @@ from jaxplore.methods import METHODS
 from tests.experiments.tiny import TINY, make_point
 
 HERE = (
+    "disagreement",
+    "max",
+    "max_reactive",
+    "max_trajectory",
+    "prediction_error",
+    "icm",
+    "icm_active",
     "implicit_grad",
     "disagreement_grad",
     "rnd",
