@@ -178,6 +178,17 @@ def make_gradient_policy(
 
     Raises:
         ValueError: the belief predicts nothing, or which of finitely many states comes next.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jaxplore import beliefs, dynamics, rewards
+        >>> belief = beliefs.make_generator_belief(2, 1, dynamics.DynamicsConfig(hidden=(8,)))
+        >>> behaviour = make_gradient_policy(
+        ...     belief, lambda prediction, delta, normalizers: rewards.variance(prediction), 2, 1,
+        ...     GradientPolicyConfig(hidden=(8,)))
+        >>> actor = behaviour.actor(behaviour.init(jax.random.key(0)))
+        >>> behaviour.act(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
+        (5, 1)
     """
     config = config or GradientPolicyConfig()
     predict, encoding = belief.predict, belief.encoding
