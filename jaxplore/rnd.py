@@ -24,6 +24,9 @@ from jaxplore.ppo import PPOConfig, PPOState, Rollout, make_ppo, minibatches
 from jaxplore.types import Array, Key, Metrics, Params, Transition
 from jaxplore.validate import Checks
 
+SCALE_SAMPLE = 1024
+"""Real transitions over which the standard deviation of bonuses is taken."""
+
 
 @dataclass(frozen=True)
 class RNDConfig:
@@ -341,7 +344,9 @@ def make_rnd_learner(
         learner: such as `make_sac` gives; it sees normalised observations.
         obs_size: `O`.
         steps_per_round: most transitions that a round brings.
-        config: of it counts `act_greedily`.
+        config: of it count `act_greedily` and `normalize_reward`: whether bonuses are divided by their standard
+            deviation over the data, as rewards of other methods are, in place of that of their discounted sum in time,
+            which remembers how large they once were.
         num_updates: updates in each round.
         rnd_config: settings of distillation.
 
@@ -372,12 +377,17 @@ def make_rnd_learner(
             batch = replay.sample(draw_key, experience.data, learner.batch_size)
             return batch._replace(reward=rnd.error(distilled, see(batch.next_obs)))
 
+        reward_std = scale.std
+        if config.normalize_reward:
+            sample_key, key = jax.random.split(key)
+            held = see(replay.sample(sample_key, experience.data, SCALE_SAMPLE).next_obs)
+            reward_std = jnp.maximum(jnp.std(rnd.error(distilled, held)), 1e-6)
         shapes = jax.eval_shape(lambda: learner.update(key, state.learner, draw(key))[1])
         nothing = jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), shapes)
         learned, metrics = behaviours.train(
-            learner, key, state.learner, draw, experience.normalizers, scale.std, num_updates, nothing
+            learner, key, state.learner, draw, experience.normalizers, reward_std, num_updates, nothing
         )
         after = RNDLearnerState(learned, distilled, scale, position)
-        return after, {**metrics, "rnd_error": error, **_told(bonus / scale.std, valid)}
+        return after, {**metrics, "rnd_error": error, **_told(bonus / reward_std, valid)}
 
     return Behaviour(init, improve, lambda state: learner.actor(state.learner), behaviours.make_act(learner, config))

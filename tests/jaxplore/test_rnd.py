@@ -137,8 +137,10 @@ def test_probabilities_are_those_under_the_policy_that_acted():
     np.testing.assert_array_equal(one, other)
 
 
-def test_a_learner_gets_the_bonus_of_successors_as_reward():
+@pytest.mark.parametrize("normalize_reward", [False, True])
+def test_a_learner_gets_the_bonus_of_successors_as_reward(normalize_reward):
     # what it is shown: normalised observations and errors of the predictor as it is after the round, over the spread
+    # of their sum in time or over their own
     def update(key, state, batch):
         return batch, {"mean": jnp.mean(batch.reward)}
 
@@ -153,15 +155,20 @@ def test_a_learner_gets_the_bonus_of_successors_as_reward():
         update=update,
         batch_size=8,
     )
-    behaviour = make_rnd_learner(spy, OBS, PER_ROUND, ImaginationConfig(act_greedily=False), 2, SMALL)
+    behaviour = make_rnd_learner(spy, OBS, PER_ROUND, ImaginationConfig(normalize_reward=normalize_reward), 2, SMALL)
     told, rnd = play(behaviour, 3, 100), make_rnd(OBS, SMALL)
     jax.tree.map(np.testing.assert_array_equal, told[0][0].rnd, behaviour.init(jax.random.key(0)).rnd)
     for state, metrics, normalizers in told[1:]:
         shown = state.learner
         mean, std = normalizers.obs.mean[None], normalizers.obs.std[None]
         np.testing.assert_allclose(shown.obs * std + mean + 1, shown.next_obs * std + mean, atol=1e-4)
-        want = rnd.error(state.rnd, shown.next_obs) / state.scale.std
-        np.testing.assert_allclose(shown.reward, want, rtol=1e-4)
+        errors, spread = rnd.error(state.rnd, shown.next_obs), float(state.scale.std)
+        if normalize_reward:
+            # the successors of all rows so far; 1,024 draws of them have their spread within a tenth
+            held = np.arange(1.0, state.position + 1)
+            every = jnp.stack([jnp.asarray(held), jnp.ones(len(held))], axis=1)
+            spread = float(jnp.std(rnd.error(state.rnd, (every - mean) / std)))
+        np.testing.assert_allclose(shown.reward, errors / spread, rtol=0.1 if normalize_reward else 1e-4)
         assert float(metrics["intrinsic_reward"]) > 0
     before, after = (np.asarray(state.rnd.predictor["output"]["kernel"]) for state, _, _ in told[:2])
     assert not np.array_equal(before, after)
