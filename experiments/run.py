@@ -100,13 +100,15 @@ def parse(argv: Sequence[str]) -> tuple[CommandLine, RunConfig]:
     """
     out, config_path = _option(argv, "out"), _option(argv, "config")
     preset, env, method = _option(argv, "preset"), _option(argv, "env"), _option(argv, "method")
-    if config_path is None and out and "--resume" in argv and os.path.exists(Path(out) / "config.json"):
-        config_path = str(Path(out) / "config.json")
+    resumed = config_path is None and out and "--resume" in argv and os.path.exists(Path(out) / "config.json")
+    if resumed:
+        config_path = str(Path(str(out)) / "config.json")
     if config_path is not None:
         start = _read_config(Path(config_path), method if method in METHODS else None)
-        # Other settings hang on these two, and the file has settled them.
+        # Other settings hang on these two, and the file has settled them. Of a run to resume, another method is told
+        # beside all else that differs.
         for name, given, saved in (("preset", preset, start.preset), ("method", method, start.method)):
-            if given is not None and given != saved:
+            if given is not None and given != saved and not (resumed and name == "method"):
                 raise ValueError(f"--{name}={given} disagrees with {config_path}, which has {saved!r}. Give one.")
     else:
         # One that is not known is refused with the other flags.
