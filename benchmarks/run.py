@@ -255,25 +255,41 @@ def _widths(hidden: tuple[int, ...]) -> str:
     return "-".join(map(str, hidden))
 
 
-def run_all(rate: float, *, quick: bool) -> Iterator[Result]:
-    """Every line of the table, in order."""
-    laptop, paper = preset_config("laptop"), preset_config("paper")
+def environments(*, quick: bool) -> Iterator[Result]:
+    """Throughput of every environment of ours."""
     for name in ("ant_maze", "half_cheetah", "hand_block"):
         yield environment_steps(name, "mujoco", 1, 300)
         for mode in ("sync", "async"):
             yield vector_steps(name, 4, 300, mode)
-        # The hand's programs take minutes to compile on a CPU.
-        for num_envs in (16,) if quick or name == "hand_block" else (1, 16, 256):
+        if name == "hand_block":
+            # Its programs take minutes to compile on a CPU.
+            sizes = () if quick else (16,)
+        else:
+            sizes = (16,) if quick else (1, 16, 256)
+        for num_envs in sizes:
             yield environment_steps(name, "mjx", num_envs, 50 if num_envs == 1 else 10)
     for name in ("nchain", "acrobot", "mountain_car"):
         for num_envs in (1, 1024):
             yield environment_steps(name, "jax", num_envs, 1000)
+
+
+def kernels(rate: float, *, quick: bool) -> Iterator[Result]:
+    """What learning is made of, at laptop and paper shapes."""
+    laptop, paper = preset_config("laptop"), preset_config("paper")
     for run, inner in ((laptop, 50), (paper, 3)):
         yield svgd_step(run.explorer, rate, inner)
         yield imagined_step(run.explorer, rate)
         yield sac_update(run.explorer, rate, 20 if run is laptop else 3)
         if run is laptop or not quick:
             yield whole_round(run, rate, 2_560 if run is laptop else 256, 3 if run is laptop else 1)
+
+
+def run_all(rate: float, *, quick: bool, only: str | None = None) -> Iterator[Result]:
+    """Every line of the table, in order, or one half of it."""
+    if only != "kernels":
+        yield from environments(quick=quick)
+    if only != "environments":
+        yield from kernels(rate, quick=quick)
 
 
 def table(results: list[Result]) -> str:
@@ -308,7 +324,10 @@ def _time(seconds: float | None) -> str:
 def main() -> int:
     """Measure, print the table, write the JSON."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.run", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="leave out 256 MJX environments and the paper's round")
+    parser.add_argument(
+        "--quick", action="store_true", help="leave out many or slow MJX environments and the paper's round"
+    )
+    parser.add_argument("--only", choices=("environments", "kernels"), help="one half of the table")
     parser.add_argument("--out", type=Path, help="JSON file to write; default: benchmarks/results/DEVICE.json")
     arguments = parser.parse_args()
     use_compilation_cache()
@@ -316,7 +335,7 @@ def main() -> int:
     rate = matmul_rate()
     print(f"{device}: {rate / 1e9:,.0f} GFLOP/s in a float32 matrix product\n")
     results = []
-    for result in run_all(rate, quick=arguments.quick):
+    for result in run_all(rate, quick=arguments.quick, only=arguments.only):
         results.append(result)
         print(f"  {result.kernel}, {result.shape}: {_time(result.seconds)}", file=sys.stderr, flush=True)
     print(table(results))
