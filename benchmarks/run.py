@@ -261,11 +261,8 @@ def environments(*, quick: bool) -> Iterator[Result]:
         yield environment_steps(name, "mujoco", 1, 300)
         for mode in ("sync", "async"):
             yield vector_steps(name, 4, 300, mode)
-        if name == "hand_block":
-            # Its programs take minutes to compile on a CPU.
-            sizes = () if quick else (16,)
-        else:
-            sizes = (16,) if quick else (1, 16, 256)
+        # The hand's programs take minutes to compile on a CPU.
+        sizes = {"hand_block": () if quick else (16,)}.get(name, (16,) if quick else (1, 16, 256))
         for num_envs in sizes:
             yield environment_steps(name, "mjx", num_envs, 50 if num_envs == 1 else 10)
     for name in ("nchain", "acrobot", "mountain_car"):
