@@ -20,6 +20,7 @@ from flax import struct
 import envs
 from envs import coverage
 from envs.base import Environment
+from envs.functional import all_finite
 from envs.wrappers import Collect, make_collect, make_collect_all, reset_all
 from envs.wrappers import CollectAll as HostCollect
 from experiments.checkpoint import Checkpoints
@@ -130,7 +131,7 @@ def make_programs(config: RunConfig, env: Environment, explorer: Explorer) -> Pr
         # The state too: what the last update of a round broke would show in the next round's metrics only.
         parts = {"belief": after.belief, "behaviour": after.behaviour, "normalizers": after.normalizers}
         finite = {name: jnp.isfinite(value) for name, value in metrics.items()}
-        finite |= {f"the state of the {name}": _all_finite(part) for name, part in parts.items()}
+        finite |= {f"the state of the {name}": all_finite(part) for name, part in parts.items()}
         return after, {**seen, **metrics}, finite
 
     def learn_all(keys: Key, state: ExplorerState, transitions: Transition, valid: Array, obs: Array, num_data: Array):
@@ -188,12 +189,6 @@ def _collect_on_host(collect: HostCollect, act: Callable[..., Array]) -> Collect
         return collect(keys, env_state, lambda keys, obs: act_all(actors, uniform, keys, obs), num_steps)
 
     return collect_all
-
-
-def _all_finite(tree: Any) -> Array:
-    """Whether every floating-point number in a tree is finite."""
-    leaves = [leaf for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    return jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in leaves] or [True]))
 
 
 def current_obs(env: Environment, env_state: Any) -> Array | np.ndarray:

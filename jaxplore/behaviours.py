@@ -19,7 +19,7 @@ from jaxplore.dynamics import Normalizers
 from jaxplore.imagination import Mover, Reward
 from jaxplore.learner import Learner
 from jaxplore.replay import Replay
-from jaxplore.types import Array, Key, Metrics, Transition
+from jaxplore.types import Array, Key, Metrics, Transition, no_metrics
 from jaxplore.validate import Checks
 
 LABEL_CHUNK = 1024
@@ -247,7 +247,7 @@ def make_imagination(
         )
         return ImaginationState(learner_state, imagined, state.age + 1), {**metrics, **seen}
 
-    return Behaviour(init, improve, lambda state: learner.actor(state.learner), make_act(learner, config))
+    return Behaviour(init, improve, lambda state: learner.actor(state.learner), make_act(learner, config.act_greedily))
 
 
 @struct.dataclass
@@ -311,15 +311,17 @@ def make_reactive(
         )
         return ReactiveState(learner_state, state.age + 1), metrics
 
-    return Behaviour(init, improve, lambda state: learner.actor(state.learner), make_act(learner, config))
+    return Behaviour(init, improve, lambda state: learner.actor(state.learner), make_act(learner, config.act_greedily))
 
 
-def make_act(learner: Learner, config: ImaginationConfig) -> Callable[[Key, Any, Normalizers, Array], Array]:
-    """`Behaviour.act` of a learner that sees normalised observations."""
+def make_act(
+    learner: Learner, act_greedily: bool, normalize_obs: bool = True
+) -> Callable[[Key, Any, Normalizers, Array], Array]:
+    """`Behaviour.act` of a learner, which sees normalised observations or, if not `normalize_obs`, as they are."""
 
     def act(key: Key, actor: Any, normalizers: Normalizers, obs: Array) -> Array:
-        seen = normalizer.normalize(normalizers.obs, obs)
-        return learner.act_greedily(actor, seen) if config.act_greedily else learner.act(key, actor, seen)
+        seen = normalizer.normalize(normalizers.obs, obs) if normalize_obs else obs
+        return learner.act_greedily(actor, seen) if act_greedily else learner.act(key, actor, seen)
 
     return act
 
@@ -368,21 +370,23 @@ def train(
     key: Key,
     state: Any,
     draw: Callable[[Key], Transition],
-    normalizers: Normalizers,
+    normalizers: Normalizers | None,
     reward_std: Array,
     num_updates: int | Array,
     metrics: Metrics,
 ) -> tuple[Any, Metrics]:
-    """`num_updates` updates, which may be a traced number, on batches that `draw` gives, observations normalised."""
+    """`num_updates` updates, which may be a traced number, on batches that `draw` gives.
+
+    Observations are normalised, or stay as they are where `normalizers` is None; rewards are divided by `reward_std`.
+    """
+
+    def see(obs: Array) -> Array:
+        return obs if normalizers is None else normalizer.normalize(normalizers.obs, obs)
 
     def one_update(i: Array, carry: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
         draw_key, update_key = jax.random.split(jax.random.fold_in(key, i))
         batch = draw(draw_key)
-        batch = batch._replace(
-            obs=normalizer.normalize(normalizers.obs, batch.obs),
-            next_obs=normalizer.normalize(normalizers.obs, batch.next_obs),
-            reward=batch.reward / reward_std,
-        )
+        batch = batch._replace(obs=see(batch.obs), next_obs=see(batch.next_obs), reward=batch.reward / reward_std)
         return learner.update(update_key, carry[0], batch)
 
     return jax.lax.fori_loop(0, num_updates, one_update, (state, metrics))
@@ -423,25 +427,19 @@ def make_model_free(
     """
     config = config or ModelFreeConfig()
 
-    def see(normalizers: Normalizers, obs: Array) -> Array:
-        return normalizer.normalize(normalizers.obs, obs) if config.normalize_obs else obs
-
-    def act(key: Key, actor: Any, normalizers: Normalizers, obs: Array) -> Array:
-        seen = see(normalizers, obs)
-        return learner.act_greedily(actor, seen) if config.act_greedily else learner.act(key, actor, seen)
-
     def improve(key: Key, state: Any, experience: Experience) -> tuple[Any, Metrics]:
-        def one_update(i: Array, carry: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
-            draw_key, update_key = jax.random.split(jax.random.fold_in(key, i))
-            batch = replay.sample(draw_key, experience.data, learner.batch_size)
-            batch = batch._replace(
-                obs=see(experience.normalizers, batch.obs), next_obs=see(experience.normalizers, batch.next_obs)
-            )
-            return learner.update(update_key, carry[0], batch)
+        return train(
+            learner,
+            key,
+            state,
+            lambda draw_key: replay.sample(draw_key, experience.data, learner.batch_size),
+            experience.normalizers if config.normalize_obs else None,
+            jnp.ones(()),
+            config.updates_per_round,
+            _no_metrics(learner, obs_size, action_size),
+        )
 
-        start = (state, _no_metrics(learner, obs_size, action_size))
-        return jax.lax.fori_loop(0, config.updates_per_round, one_update, start)
-
+    act = make_act(learner, config.act_greedily, config.normalize_obs)
     return Behaviour(learner.init, improve, learner.actor, act)
 
 
@@ -450,8 +448,7 @@ def _no_metrics(learner: Learner, obs_size: int, action_size: int) -> Metrics:
     flag, obs = jnp.zeros(1, bool), jnp.zeros((1, obs_size))
     batch = Transition(obs, jnp.zeros((1, action_size)), jnp.zeros(1), obs, flag, flag)
     key = jax.random.key(0)
-    shapes = jax.eval_shape(lambda rows: learner.update(key, learner.init(key), rows)[1], batch)
-    return jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), shapes)
+    return no_metrics(lambda: learner.update(key, learner.init(key), batch)[1])
 
 
 def _reward_std(data: Replay[Transition], wanted: bool) -> Array:

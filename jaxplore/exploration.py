@@ -17,7 +17,7 @@ from jaxplore.behaviours import Experience, uniform_actions
 from jaxplore.dynamics import Normalizers
 from jaxplore.methods import ExplorationConfig, Method, Sizes, check_fits, divergence_reward
 from jaxplore.replay import Replay
-from jaxplore.types import Array, Key, Metrics, Transition
+from jaxplore.types import Array, Key, Metrics, Transition, no_metrics
 
 
 @struct.dataclass
@@ -126,8 +126,7 @@ def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Ex
         def step(i: Array, carry: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
             return belief.update(jax.random.fold_in(steps_key, i), carry[0], state.data, state.normalizers)
 
-        shapes = jax.eval_shape(lambda: belief.update(steps_key, start, state.data, state.normalizers)[1])
-        metrics = jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), shapes)
+        metrics = no_metrics(lambda: belief.update(steps_key, start, state.data, state.normalizers)[1])
         return jax.lax.fori_loop(0, config.fit.num_steps(num_data), step, (start, metrics))
 
     def improve(key: Key, state: ExplorerState, obs: Array, num_data: Array) -> tuple[ExplorerState, Metrics]:

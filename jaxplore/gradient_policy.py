@@ -27,7 +27,7 @@ from jaxplore.networks import (
     sample_tanh_gaussian,
     tanh_mean,
 )
-from jaxplore.types import Array, Key, Metrics, Params
+from jaxplore.types import Array, Key, Metrics, Params, no_metrics
 from jaxplore.validate import Checks
 
 
@@ -234,8 +234,7 @@ def make_gradient_policy(
         def one(i: Array, carry: tuple[GradientPolicyState, Metrics]) -> tuple[GradientPolicyState, Metrics]:
             return update(jax.random.fold_in(updates_key, i), carry[0], experience)
 
-        shapes = jax.eval_shape(lambda: update(updates_key, start, experience)[1])
-        metrics = jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), shapes)
+        metrics = no_metrics(lambda: update(updates_key, start, experience)[1])
         return jax.lax.fori_loop(0, config.updates, one, (start, metrics))
 
     def act(key: Key, actor: Params, normalizers: Normalizers, obs: Array) -> Array:

@@ -21,7 +21,7 @@ from jaxplore.learner import Learner
 from jaxplore.networks import ACTIVATIONS, MLP, apply
 from jaxplore.normalizer import Normalizer
 from jaxplore.ppo import PPOConfig, PPOState, Rollout, make_ppo, minibatches
-from jaxplore.types import Array, Key, Metrics, Params, Transition
+from jaxplore.types import Array, Key, Metrics, Params, Transition, no_metrics
 from jaxplore.validate import Checks
 
 SCALE_SAMPLE = 1024
@@ -308,8 +308,7 @@ def make_rnd_ppo(
         taken = experience.num_data - warm_up_steps
         length = ppo_config.rollout_steps
         is_due = taken // length > jnp.maximum(taken - steps_per_round, 0) // length
-        shapes = jax.eval_shape(lambda: learn(key, state, experience)[1])
-        nothing = jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), shapes)
+        nothing = no_metrics(lambda: learn(key, state, experience)[1])
         after, metrics = jax.lax.cond(is_due, lambda: learn(key, state, experience), lambda: (state, nothing))
         return after, {**metrics, **seen}
 
@@ -382,12 +381,13 @@ def make_rnd_learner(
             sample_key, key = jax.random.split(key)
             held = see(replay.sample(sample_key, experience.data, SCALE_SAMPLE).next_obs)
             reward_std = jnp.maximum(jnp.std(rnd.error(distilled, held)), 1e-6)
-        shapes = jax.eval_shape(lambda: learner.update(key, state.learner, draw(key))[1])
-        nothing = jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), shapes)
+        nothing = no_metrics(lambda: learner.update(key, state.learner, draw(key))[1])
         learned, metrics = behaviours.train(
             learner, key, state.learner, draw, experience.normalizers, reward_std, num_updates, nothing
         )
         after = RNDLearnerState(learned, distilled, scale, position)
         return after, {**metrics, "rnd_error": error, **_told(bonus / reward_std, valid)}
 
-    return Behaviour(init, improve, lambda state: learner.actor(state.learner), behaviours.make_act(learner, config))
+    return Behaviour(
+        init, improve, lambda state: learner.actor(state.learner), behaviours.make_act(learner, config.act_greedily)
+    )

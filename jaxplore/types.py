@@ -17,9 +17,11 @@ Shape letters, declared here once:
 Keys are typed (`jax.random.key`), named `key`, and consumed by the function that takes them.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
+import jax.numpy as jnp
 
 Array: TypeAlias = jax.Array
 Key: TypeAlias = jax.Array
@@ -30,6 +32,17 @@ Params: TypeAlias = Any
 
 Metrics: TypeAlias = dict[str, Array]
 """Scalars to look at. Never carried: what the next step needs lives in a state."""
+
+
+def no_metrics(call: Callable[[], Metrics]) -> Metrics:
+    """Zeros in the shape of what `call` gives, which is traced and not run: what a loop that may not turn starts with.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> no_metrics(lambda: {"loss": jnp.float32(3.0)})["loss"].item()
+        0.0
+    """
+    return jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), jax.eval_shape(call))
 
 
 class Transition(NamedTuple):
