@@ -4,6 +4,7 @@ import dataclasses
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from experiments import compare
@@ -38,8 +39,8 @@ def runs(tmp_path: Path) -> list[Path]:
 def test_table_and_files(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture):
     assert compare.main([*map(str, runs), f"--out={tmp_path / 'out'}"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert "| `implicit` | 3 | 6 (5 to 7) | 5, 7, 6 | 700 | 1.0 |" in lines
-    assert "| `random` | 1 | 3 (3 to 3) | 3 | - | 1.0 |" in lines
+    assert "| `implicit` | 3 | 6 (5 to 7) | 5, 7, 6 | 700 | 61% +- 51 | 1.0 |" in lines
+    assert "| `random` | 1 | 3 (3 to 3) | 3 | - | 34% | 1.0 |" in lines
     record = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert record["methods"]["implicit"][1]["reached"] == [25, 50, 75, 100, 125, 150, 700]
     assert record["methods"]["random"][0] == {"seed": 0, "cells": 3, "reached": [25, 50, 625], "minutes": 1.0}
@@ -63,6 +64,38 @@ def test_runs_of_different_lengths_meet_at_a_step(runs: list[Path], tmp_path: Pa
     assert random.outcomes[0].reached == (25, 50)
     with pytest.raises(RunError, match="short stands at step 500 of 600"):
         compare.group([short], until=600)
+
+
+def test_the_interval_is_students():
+    # mean 2, standard error 1 / sqrt(3), and 4.3027 as every table of t has it for 2 degrees of freedom
+    mean, half_width = compare.interval(np.array([1.0, 2.0, 3.0]))
+    assert mean == 2.0
+    assert half_width == pytest.approx(4.3027 / np.sqrt(3), rel=1e-4)
+    assert compare.interval(np.array([5.0])) == (5.0, None)
+
+
+def test_names_tell_settings_of_one_method_apart(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture):
+    again = write_run(tmp_path / "e", "implicit", 0, [25, 50])
+    named = [f"cold={runs[0]}", f"hot={again}", str(runs[1])]
+    assert compare.main([*named, f"--out={tmp_path / 'out'}"]) == 0
+    told = [line.split("|")[1:4] for line in capsys.readouterr().out.splitlines()[2:5]]
+    assert told == [
+        [" `cold` ", " 1 ", " 5 (5 to 5) "],
+        [" `hot` ", " 1 ", " 2 (2 to 2) "],
+        [" `implicit` ", " 1 ", " 7 (7 to 7) "],
+    ]
+    assert list(json.loads((tmp_path / "out" / "comparison.json").read_text())["methods"]) == [
+        "cold",
+        "hot",
+        "implicit",
+    ]
+
+
+def test_a_path_with_an_equals_sign_is_a_path(tmp_path: Path):
+    there = tmp_path / "lr=1e-3"
+    there.mkdir()
+    assert compare.split_name(str(there)) == (None, there)
+    assert compare.split_name("hot=runs/lr=1") == ("hot", Path("runs/lr=1"))
 
 
 @pytest.mark.parametrize(
