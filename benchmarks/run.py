@@ -27,13 +27,15 @@ from experiments import loop
 from experiments.config import RunConfig, preset_config
 from experiments.run import use_compilation_cache, versions
 from jaxplore import beliefs, dynamics, imagination, replay, rewards
-from jaxplore.methods import ExplorationConfig
+from jaxplore.exploration import make_explorer
+from jaxplore.methods import METHODS, ExplorationConfig, Sizes
 from jaxplore.sac import make_sac
 from jaxplore.types import Transition
 
 RESULTS = Path(__file__).parent / "results"
 OBS, ACTION = 31, 8
 """Sizes of the Ant maze."""
+PARTS = ("environments", "kernels", "methods")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -251,6 +253,44 @@ def whole_round(run: RunConfig, rate: float, num_data: int, repeats: int) -> Res
     return _result("whole round", shape, timing, flop, rate)
 
 
+ROUNDS = 6
+"""Rounds of 25 steps timed in one: PPO learns once in 128 steps, so not in each."""
+
+
+def method_round(name: str, num_data: int = 2_560) -> Result:
+    """A laptop round of one method with `num_data` transitions held: take 25 in, fit, imagine, improve."""
+    method, config = METHODS[name], preset_config("laptop", method=name).explorer
+    sizes = Sizes(OBS, ACTION, discrete=method.actions == "discrete", has_reward=True)
+    explorer = make_explorer(method, sizes, config)
+    data = _random_data(num_data, num_data).rows
+    chunk = jax.tree.map(lambda leaf: leaf[: config.steps_per_round], data)
+    obs, came, held = jnp.zeros((1, OBS)), jnp.ones(config.steps_per_round, bool), jnp.ones(num_data, bool)
+
+    def one(key: jax.Array, state: Any, obs: jax.Array) -> Any:
+        return explorer.improve(key, explorer.observe(state, chunk, came), obs, jnp.int32(num_data))[0]
+
+    # One seed under vmap and each round waited for, as the loop does it.
+    learn = jax.jit(jax.vmap(one), donate_argnums=1)
+
+    def rounds(state: Any) -> Any:
+        for i in range(ROUNDS):
+            state = jax.block_until_ready(learn(jax.random.split(jax.random.key(i), 1), state, obs))
+        return state
+
+    def begin(key: jax.Array) -> Any:
+        return explorer.observe(explorer.init(key), data, held)
+
+    start = jax.block_until_ready(jax.jit(jax.vmap(begin))(jax.random.split(jax.random.key(0), 1)))
+    timing = _donating(rounds, start, ROUNDS)
+    return _result(f"round, {name}", f"laptop, N = {num_data:,}", timing)
+
+
+def methods() -> Iterator[Result]:
+    """What a round of each method costs."""
+    for name in METHODS:
+        yield method_round(name)
+
+
 def _widths(hidden: tuple[int, ...]) -> str:
     return "-".join(map(str, hidden))
 
@@ -282,11 +322,13 @@ def kernels(rate: float, *, quick: bool) -> Iterator[Result]:
 
 
 def run_all(rate: float, *, quick: bool, only: str | None = None) -> Iterator[Result]:
-    """Every line of the table, in order, or one half of it."""
-    if only != "kernels":
+    """Every line of the table, in order, or one part of it."""
+    if only in (None, "environments"):
         yield from environments(quick=quick)
-    if only != "environments":
+    if only in (None, "kernels"):
         yield from kernels(rate, quick=quick)
+    if only in (None, "methods"):
+        yield from methods()
 
 
 def table(results: list[Result]) -> str:
@@ -324,7 +366,7 @@ def main() -> int:
     parser.add_argument(
         "--quick", action="store_true", help="leave out many or slow MJX environments and the paper's round"
     )
-    parser.add_argument("--only", choices=("environments", "kernels"), help="one half of the table")
+    parser.add_argument("--only", choices=PARTS, help="one part of the table")
     parser.add_argument("--out", type=Path, help="JSON file to write; default: benchmarks/results/DEVICE.json")
     arguments = parser.parse_args()
     use_compilation_cache()

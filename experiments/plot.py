@@ -67,6 +67,8 @@ class Curves(NamedTuple):
     """The quantity, `[S, T]`; NaN where there is none."""
 
 
+MOST_IN_PICTURE = 4
+"""More groups than these are named beside the picture: inside, names would cover lines."""
 MOST_EPISODES = 40
 """Up to so many episodes are worth counting along an axis."""
 
@@ -105,15 +107,16 @@ def plot_coverage(
             episodes.set_xlabel("episodes")
             episodes.tick_params(length=2)
             episodes.spines["top"].set_visible(False)
-        for colour, group in zip(_colours(curves), curves, strict=True):
+        faint = 0.45 if len(curves) <= MOST_IN_PICTURE else 0.25
+        for (colour, dashes), group in zip(_colours(curves), curves, strict=True):
             # A value holds until the next one is known: coverage goes up in steps.
             many = len(group.values) > 1
             for values in group.values:
-                width, alpha = (0.9, 0.45) if many else (2.2, 1.0)
+                width, alpha = (0.9, faint) if many else (2.2, 1.0)
                 axes.plot(group.steps, values, color=colour, linewidth=width, alpha=alpha, drawstyle="steps-post")
             label = f"{group.label}, {'median of ' if many else ''}n = {len(group.values)}"
             middle = np.median(group.values, axis=0)
-            axes.plot(group.steps, middle, color=colour, linewidth=2.4, drawstyle="steps-post", label=label)
+            axes.plot(group.steps, middle, dashes, color=colour, linewidth=2.4, drawstyle="steps-post", label=label)
         axes.set_ylim(0, 1.04)
         axes.yaxis.set_major_locator(FixedLocator([0, 0.2, 0.4, 0.6, 0.8, 1]))
         axes.yaxis.set_major_formatter(PercentFormatter(1, decimals=0))
@@ -137,7 +140,7 @@ def plot_coverage(
             counts.spines["right"].set_visible(False)
             for count in range(1, cells + 1):
                 axes.axhline(count / cells, color="#e4e4e4", linewidth=0.7, zorder=0)
-        _finish(figure, axes, path, curves, title, "lower right")
+        _finish(figure, axes, path, curves, title, "best")
 
 
 def plot_intrinsic_reward(
@@ -161,7 +164,7 @@ def plot_intrinsic_reward(
         figure = Figure(figsize=(6.6, 4.1), layout="constrained")
         axes = figure.subplots()
         drawn = [value[np.isfinite(value)] for group in curves for value in group.values]
-        for colour, group in zip(_colours(curves), curves, strict=True):
+        for (colour, dashes), group in zip(_colours(curves), curves, strict=True):
             if not np.isfinite(group.values).any():
                 continue
             for values in group.values:
@@ -169,7 +172,8 @@ def plot_intrinsic_reward(
             window = len(group.steps) // 50 * 2 + 1
             label = f"{group.label}, {'median of ' if len(group.values) > 1 else ''}n = {len(group.values)}"
             label += f" (bold: mean of {window} rounds)" if window > 1 else ""
-            axes.plot(group.steps, _smooth(_median(group.values), window), color=colour, linewidth=2.4, label=label)
+            middle = _smooth(_median(group.values), window)
+            axes.plot(group.steps, middle, dashes, color=colour, linewidth=2.4, label=label)
         positive = np.concatenate([values[values > 0] for values in drawn])
         if not sum(map(len, drawn)):
             axes.set_yticks([])
@@ -264,8 +268,11 @@ def _check(curves: Sequence[Curves]) -> None:
             raise ValueError(f"{group.label}: values {values} and steps {steps} must be [S, T] and [T]")
 
 
-def _colours(curves: Sequence[Curves]) -> list[str]:
-    return [_COLOURS[index % len(_COLOURS)] for index in range(len(curves))]
+def _colours(curves: Sequence[Curves]) -> list[tuple[str, str]]:
+    """A colour and a line style each; where colours run out they come again, dashed and then dotted."""
+    styles = ("-", "--", ":")
+    count = len(_COLOURS)
+    return [(_COLOURS[i % count], styles[i // count % len(styles)]) for i in range(len(curves))]
 
 
 def _median(values: np.ndarray) -> np.ndarray:
@@ -291,7 +298,11 @@ def _finish(
     axes.xaxis.set_major_formatter(FuncFormatter(lambda step, _: f"{step:,.0f}"))
     axes.set_xlabel("environment steps")
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(loc=legend, frameon=True, framealpha=0.9, edgecolor="none")
+        if len(curves) > MOST_IN_PICTURE:
+            figure.set_figwidth(figure.get_figwidth() * 1.4)
+            figure.legend(loc="outside right upper", frameon=False)
+        else:
+            axes.legend(loc=legend, frameon=True, framealpha=0.9, edgecolor="none")
     if title:
         axes.set_title(title, loc="left")
     _save(figure, path)

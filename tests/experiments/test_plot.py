@@ -150,3 +150,17 @@ def test_unwritable_pictures_are_named(tmp_path: Path):
     (tmp_path / "file").write_text("")
     with pytest.raises(RunError, match=r"c\.png"):
         plot_coverage(tmp_path / "file" / "c.png", [Curves("implicit", STEPS, seeds(1))], COVERAGE)
+
+
+def test_many_groups_are_told_apart_and_named_beside_the_picture(tmp_path: Path, figures: list[Figure]):
+    # ten methods: each line its own colour and dashes, the names outside the axes
+    steps = np.arange(1, 5) * 25
+    curves = [Curves(f"method {i}", steps, np.full((2, 4), i / 10)) for i in range(10)]
+    plot_coverage(tmp_path / "c.png", curves, COVERAGE)
+    check_picture(tmp_path / "c.png", 1600)
+    axes = figures[0].axes[0]
+    bold = [line for line in axes.get_lines() if str(line.get_label()).startswith("method")]
+    assert len({(line.get_color(), line.get_linestyle()) for line in bold}) == 10
+    assert axes.get_legend() is None
+    (legend,) = figures[0].legends
+    assert [text.get_text() for text in legend.get_texts()] == [f"method {i}, median of n = 2" for i in range(10)]
