@@ -16,7 +16,9 @@ from jaxplore.generator import Generator, GeneratorConfig, make_generator
 from jaxplore.gradient_policy import GradientPolicyConfig, make_gradient_policy
 from jaxplore.imagination import rollout
 from jaxplore.learner import Learner
+from jaxplore.mcts import MCTSConfig, make_mcts
 from jaxplore.methods import METHODS, ExplorationConfig, Method, Sizes, get_method
+from jaxplore.planning import make_tree_search
 from jaxplore.ppo import PPO, PPOConfig, make_ppo
 from jaxplore.rnd import RNDConfig, make_rnd
 from jaxplore.sac import SACConfig, make_sac
@@ -48,6 +50,7 @@ __all__ = [
     "GradientPolicyConfig",
     "ImaginationConfig",
     "Learner",
+    "MCTSConfig",
     "Method",
     "ModelFreeConfig",
     "PPOConfig",
@@ -66,9 +69,11 @@ __all__ = [
     "make_generator",
     "make_generator_belief",
     "make_gradient_policy",
+    "make_mcts",
     "make_ppo",
     "make_rnd",
     "make_sac",
+    "make_tree_search",
     "rewards",
     "rollout",
     "stein_direction",
