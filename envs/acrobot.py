@@ -61,6 +61,11 @@ def start(key: Key) -> Array:
     return jax.random.uniform(key, (4,), minval=-RESET_SCALE, maxval=RESET_SCALE)
 
 
+def start_in(key: Key, cell: int) -> Array:
+    """`start`, held out to the right (cell 0) or to the left (cell 1) instead of down."""
+    return start(key).at[0].add(jnp.where(cell == 0, 0.5, -0.5) * jnp.pi)
+
+
 def derivative(state: Array, torque: Array) -> Array:
     """Velocities and accelerations `[4]` of angles and velocities `[4]` under a torque [N m] at the second joint."""
     theta1, theta2, speed1, speed2 = state
@@ -172,5 +177,6 @@ def make_acrobot(backend: str = "auto", obs_noise: float = 0.0, horizontal: floa
         coverage=make_horizontal_coverage(horizontal),
         reward=lambda before, action, after: jnp.where(height(after) > GOAL_HEIGHT, 0.0, -1.0),
         view=_make_view(horizontal),
+        start_in=start_in,
     )
     return make_environment(rules, obs_noise)

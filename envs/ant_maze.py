@@ -164,6 +164,12 @@ def start(key: Key) -> tuple[Array, Array]:
     return qpos, RESET_SCALE * jax.random.normal(qvel_key, (14,))
 
 
+def start_in(key: Key, cell: int) -> tuple[Array, Array]:
+    """`start`, at the centre of a cell."""
+    qpos, qvel = start(key)
+    return qpos.at[:2].add(PITCH * jnp.array(FREE, qpos.dtype)[cell]), qvel
+
+
 def observe(xp: ModuleType, qpos_before: Any, qpos: Any, qvel: Any) -> Any:
     """The observation `[31]`: torso velocity in x and y over the step [m/s], qpos `[15]`, qvel `[14]`."""
     return xp.concatenate([(qpos[:2] - qpos_before[:2]) / DT, qpos, qvel])
@@ -193,5 +199,6 @@ def make_ant_maze(backend: str = "auto", obs_noise: float = 0.0) -> Environment:
         coverage=make_box_coverage(POSITION, CELLS, "maze cells"),
         cameras=("track", "overview"),
         floor_plan=FloorPlan(POSITION, WALLS, CELLS),
+        start_in=start_in,
     )
     return choose_engine(backend).make_environment(task, obs_noise)

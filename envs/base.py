@@ -133,6 +133,9 @@ class Environment:
     step_all: Callable[[tuple[EnvState, ...], np.ndarray], tuple[tuple[EnvState, ...], Transition]] | None = None
     """On the host: `step_all(states, actions [S, A]) -> (states, transitions [S])`, what `step` gives for each state.
     None: one after the other."""
+    reset_in: Callable[[Key, int], EnvState] | None = None
+    """`reset_in(key, cell) -> state`: a start in one of the coverage cells, for asking what an agent knows of a place
+    that it has not been to; no run begins there. None: this environment cannot be put where one likes."""
 
 
 class Physics(NamedTuple):
@@ -167,6 +170,8 @@ class Task(NamedTuple):
     cameras: tuple[str, ...]
     """Names of the model's cameras, the usual one first."""
     floor_plan: FloorPlan | None = None
+    start_in: Callable[[Key, int], tuple[Array, Array]] | None = None
+    """`start_in(key, cell)`: as `start`, in a coverage cell; see `Environment.reset_in`."""
     control: Callable[[ModuleType, Array], Array] = lambda xp, action: action
     """`control(xp, action [A]) -> ctrl [nu]`, of an action in [-1, 1]."""
 

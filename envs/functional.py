@@ -4,6 +4,7 @@
 a bad action is, numbers that are not finite) is here; what the environment is, is its `Rules`.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -33,6 +34,8 @@ class Rules(NamedTuple):
     """`terminated(physics) -> bool`: whether the task ends here. A time limit is not this, but `spec.episode_steps`."""
     floor_plan: FloorPlan | None = None
     view: View | None = None
+    start_in: Callable[[Key, int], Any] | None = None
+    """`start_in(key, cell) -> physics`: as `start`, in a coverage cell; see `Environment.reset_in`."""
 
 
 def make_environment(rules: Rules, obs_noise: float = 0.0, backend: str = BACKEND) -> Environment:
@@ -74,9 +77,9 @@ def make_environment(rules: Rules, obs_noise: float = 0.0, backend: str = BACKEN
         key, noise_key = jax.random.split(key)
         return key, obs + obs_noise * jax.random.normal(noise_key, obs.shape, obs.dtype)
 
-    def reset(key: Key) -> EnvState:
+    def reset_to(start: Callable[..., Any], key: Key, *cell: int) -> EnvState:
         start_key, key = jax.random.split(key)
-        physics = rules.start(start_key)
+        physics = start(start_key, *cell)
         key, obs = observe(key, physics, physics)
         return EnvState(physics, obs, jnp.int32(0), key)
 
@@ -101,7 +104,17 @@ def make_environment(rules: Rules, obs_noise: float = 0.0, backend: str = BACKEN
         )
         return EnvState(after, obs, num_steps, key), transition
 
-    return Environment(spec, reset, step, rules.coverage, backend, True, rules.floor_plan, rules.view)
+    return Environment(
+        spec,
+        functools.partial(reset_to, rules.start),
+        step,
+        rules.coverage,
+        backend,
+        True,
+        rules.floor_plan,
+        rules.view,
+        reset_in=rules.start_in and functools.partial(reset_to, rules.start_in),
+    )
 
 
 def all_finite(tree: Any) -> Array:

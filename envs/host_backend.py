@@ -8,6 +8,8 @@ the same bits. As the scratch space is shared, one environment must not be stepp
 # mujoco ships no stubs, and NumPy arrays stand where the contract says Array.
 
 import copy
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -74,10 +76,11 @@ def make_environment(task: Task, obs_noise: float = 0.0) -> Environment:
     spec, physics = task.spec, make_physics(task.model, task.frame_skip)
     action_shape = (spec.action_size,)
 
-    @jax.jit
-    def start(key: Key) -> tuple[Array, Array, Key]:
+    def begin(start: Callable[..., tuple[Array, Array]], key: Key, *cell: int) -> tuple[Array, Array, Key]:
         start_key, key = jax.random.split(key)
-        return *task.start(start_key), key
+        return *start(start_key, *cell), key
+
+    begin = jax.jit(begin, static_argnums=0)
 
     @jax.jit
     def draw(key: Key) -> tuple[Key, Array]:
@@ -99,8 +102,8 @@ def make_environment(task: Task, obs_noise: float = 0.0) -> Environment:
         with np.errstate(over="ignore", invalid="ignore"):
             return task.reward(np, action, physics.qpos(before), physics.qpos(after), physics.qvel(after))
 
-    def reset(key: Key) -> EnvState:
-        qpos, qvel, key = start(key)
+    def reset_to(start: Callable[..., tuple[Array, Array]], key: Key, *cell: int) -> EnvState:
+        qpos, qvel, key = begin(start, key, *cell)
         state = physics.init(*jax.device_get((qpos, qvel)))
         key, obs = noisy(key, observe(state, state))
         return EnvState(state, obs, np.int32(0), key)
@@ -128,4 +131,14 @@ def make_environment(task: Task, obs_noise: float = 0.0) -> Environment:
         return EnvState(after, obs, num_steps, key), transition
 
     view = make_mujoco_view(task.model, lambda state: physics.qpos(state.physics), task.cameras)
-    return Environment(spec, reset, step, task.coverage, BACKEND, False, task.floor_plan, view)
+    return Environment(
+        spec,
+        functools.partial(reset_to, task.start),
+        step,
+        task.coverage,
+        BACKEND,
+        False,
+        task.floor_plan,
+        view,
+        reset_in=task.start_in and functools.partial(reset_to, task.start_in),
+    )

@@ -80,7 +80,7 @@ def make_environment(task: Task, obs_noise: float = 0.0) -> Environment:
     Raises:
         ValueError: `obs_noise` is negative or not finite; from `step`, when traced: the action is not of shape `[A]`.
     """
-    physics = make_physics(task.model, task.frame_skip)
+    physics, start_in = make_physics(task.model, task.frame_skip), task.start_in
 
     def known(state: MjxState) -> tuple[Array, Array]:
         return physics.qpos(state), physics.qvel(state)
@@ -94,5 +94,6 @@ def make_environment(task: Task, obs_noise: float = 0.0) -> Environment:
         coverage=task.coverage,
         floor_plan=task.floor_plan,
         view=make_mujoco_view(task.model, lambda state: physics.qpos(state.physics), task.cameras),
+        start_in=start_in and (lambda key, cell: physics.init(*start_in(key, cell))),
     )
     return functional.make_environment(rules, obs_noise, BACKEND)

@@ -51,6 +51,13 @@ def start(key: Key) -> Array:
     return jnp.stack([jax.random.uniform(key, minval=START[0], maxval=START[1]), jnp.float32(0)])
 
 
+def start_in(key: Key, cell: int) -> Array:
+    """Anywhere in a cell."""
+    low = jnp.array([MIN_POSITION, -MAX_SPEED])
+    size = (jnp.array([MAX_POSITION, MAX_SPEED]) - low) / BINS
+    return low + size * (jnp.stack([cell // BINS, cell % BINS]) + jax.random.uniform(key, (2,)))
+
+
 def advance(key: Key, state: Array, action: Array) -> Array:
     """Position and velocity `[2]` a step later. Nothing happens by chance."""
     position, velocity = state
@@ -119,5 +126,6 @@ def make_mountain_car(backend: str = "auto", obs_noise: float = 0.0) -> Environm
         reward=lambda before, action, after: jnp.where(reached(after), GOAL_REWARD, 0.0),
         terminated=reached,
         view=make_sketch_view((MIN_POSITION - 0.1, MAX_POSITION + 0.1, -0.05, 1.4), draw),
+        start_in=start_in,
     )
     return make_environment(rules, obs_noise)

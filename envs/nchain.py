@@ -97,6 +97,7 @@ def make_nchain(backend: str = "auto", obs_noise: float = 0.0, num_states: int =
         view=make_sketch_view(
             (-1.0, min(num_states, LINKS_PER_ROW), -num_rows, 1.0), lambda axes, state: _draw(axes, state, flips)
         ),
+        start_in=lambda key, cell: jnp.int32(cell),
     )
     return make_environment(rules)
 

@@ -17,10 +17,10 @@ from scipy import stats
 
 from envs.base import Coverage
 from experiments import plot
-from experiments.config import RunConfig, from_json
+from experiments.config import RunConfig
 from experiments.errors import RunError, disk_error
 from experiments.log import duration, read_metrics
-from experiments.loop import make_environment
+from experiments.loop import make_environment, read_config
 from experiments.report import series
 
 POINTS = 100
@@ -81,10 +81,7 @@ def load(run: Path, until: int | None = None) -> tuple[RunConfig, list[dict[str,
     Raises:
         RunError: `run` holds no run, or one that has not come that far.
     """
-    try:
-        config = from_json((run / "config.json").read_text(), str(run / "config.json"))
-    except OSError as error:
-        raise RunError(f"{run} holds no run: cannot read {run / 'config.json'} ({error.strerror}).") from error
+    config = read_config(run)
     rows = read_metrics(run / "metrics.jsonl")
     last = max((row["step"] for row in rows), default=0)
     if last < (until or config.steps):

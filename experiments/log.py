@@ -368,18 +368,22 @@ def summary(
         columns = list(zip(write, zip(*(own for _, own in values), strict=True), strict=True))
         lines.append(("median", *(f(statistics.median(column)) for f, column in columns)))
         lines.append(("range", *(_range(f(min(column)), f(max(column)), " to ") for f, column in columns)))
-    widths = [max(map(len, column)) for column in zip(head, *lines, strict=True)]
-    text = ["   ".join(map(str.rjust, line, widths)) for line in (head, *lines)]
-    rule = "-" * len(text[0])
-    text[1:1] = [rule]
+    text = table(head, lines).split("\n")
     if len(seeds) > 1:
-        text[-2:-2] = [rule]
+        text[-2:-2] = [text[1]]
     if dropped := sum(row.get("dropped") or 0 for row in rows):
         text += ["", f"{dropped:,} steps dropped: physics that diverged, which ends an episode and is no data"]
     if files:
         width = max(map(len, files))
         text += ["", *(f"{name.ljust(width)}   {os.fspath(path)}" for name, path in files.items())]
     return "\n".join(text)
+
+
+def table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
+    """Right-aligned columns with a rule below their names, as plain text."""
+    widths = [max(map(len, column)) for column in zip(head, *lines, strict=True)]
+    text = ["   ".join(map(str.rjust, line, widths)) for line in (head, *lines)]
+    return "\n".join((text[0], "-" * len(text[0]), *text[1:]))
 
 
 def _outcome(rows: Sequence[Row]) -> tuple[float, float, float, float, float]:

@@ -24,7 +24,7 @@ from envs.functional import all_finite
 from envs.wrappers import Collect, make_collect, make_collect_all, reset_all
 from envs.wrappers import CollectAll as HostCollect
 from experiments.checkpoint import Checkpoints
-from experiments.config import RunConfig
+from experiments.config import RunConfig, from_json
 from experiments.errors import RunError, disk_error
 from experiments.log import MetricsLog, Progress, Row, TensorBoardLog
 from jaxplore.exploration import Explorer, ExplorerState, make_explorer
@@ -82,11 +82,22 @@ def make_environment(config: RunConfig) -> Environment:
     return env
 
 
+def on_host(config: RunConfig, env: Environment) -> Environment:
+    """The same environment with its physics on the host, where it has the choice: there nothing is compiled."""
+    if env.backend != "mjx" or config.env not in envs.FACTORIES:
+        return env
+    return make_environment(dataclasses.replace(config, backend="mujoco"))
+
+
 def make_run_explorer(config: RunConfig, env: Environment) -> Explorer:
     """The explorer that a configuration names, for its environment."""
+    return make_explorer(get_method(config.method), sizes_of(env), config.explorer)
+
+
+def sizes_of(env: Environment) -> Sizes:
+    """What a method must know of an environment."""
     spec = env.spec
-    sizes = Sizes(spec.obs_size, spec.action_size, spec.discrete, spec.one_hot_obs, spec.has_reward)
-    return make_explorer(get_method(config.method), sizes, config.explorer)
+    return Sizes(spec.obs_size, spec.action_size, spec.discrete, spec.one_hot_obs, spec.has_reward)
 
 
 def make_programs(config: RunConfig, env: Environment, explorer: Explorer) -> Programs:
@@ -257,6 +268,34 @@ def _write_walk(out: Path, state: RunState) -> None:
         draft.replace(out / WALK)
     except OSError as error:
         raise disk_error("write the walk", out, error, "finish with --resume") from error
+
+
+def read_config(out: Path) -> RunConfig:
+    """The configuration of the run in `out`.
+
+    Raises:
+        RunError: there is no run.
+        ValueError: its configuration is not one.
+    """
+    path = out / "config.json"
+    try:
+        return from_json(path.read_text(), str(path))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise RunError(f"{out} holds no run: cannot read {path} ({reason}).") from error
+
+
+def last_state(out: Path, config: RunConfig, env: Environment, explorer: Explorer) -> tuple[RunState, int]:
+    """The state in the latest checkpoint of the run in `out`, and its step.
+
+    Raises:
+        RunError: there is no checkpoint, or none that fits the configuration.
+    """
+    init = make_programs(config, env, explorer).init
+    restored = Checkpoints(out / "checkpoints").restore_latest(jax.eval_shape(init) if env.compiled else init())
+    if restored is None:
+        raise RunError(f"{out} has no checkpoint yet: let the run go on for {config.checkpoint_every:,} steps.")
+    return restored.state, restored.step
 
 
 def is_finished(out: Path) -> bool:

@@ -75,25 +75,16 @@ def load_actor(run: Path) -> tuple[RunConfig, Environment, Act, int]:
     import jax
 
     from experiments import loop
-    from experiments.checkpoint import Checkpoints
-    from experiments.config import from_json
 
-    try:
-        config = from_json((run / "config.json").read_text(), str(run / "config.json"))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise RunError(f"{run} holds no run: cannot read {run / 'config.json'} ({reason}).") from error
+    config = loop.read_config(run)
     own_env = loop.make_environment(config)
-    env = _on_host(config, own_env)
+    env = loop.on_host(config, own_env)
     _check_view(env, config.env)
     explorer = loop.make_run_explorer(config, own_env)
-    init = loop.make_programs(config, own_env, explorer).init
-    restored = Checkpoints(run / "checkpoints").restore_latest(jax.eval_shape(init) if own_env.compiled else init())
-    if restored is None:
-        raise RunError(f"{run} has no checkpoint yet: let the run go on for {config.checkpoint_every:,} steps.")
-    actor = explorer.actor(jax.tree.map(lambda leaf: leaf[0], restored.state.explorer))
+    state, step = loop.last_state(run, config, own_env, explorer)
+    actor = explorer.actor(jax.tree.map(lambda leaf: leaf[0], state.explorer))
     act = jax.jit(lambda key, obs: explorer.act(key, actor, obs))
-    return config, env, act, restored.step
+    return config, env, act, step
 
 
 def load_random(name: str) -> tuple[RunConfig, Environment, Act]:
@@ -110,19 +101,9 @@ def load_random(name: str) -> tuple[RunConfig, Environment, Act]:
 
     config = dataclasses.replace(preset_config("laptop", name), method="random")
     env = loop.make_environment(config)
-    env = _on_host(config, env)
+    env = loop.on_host(config, env)
     _check_view(env, name)
     return config, env, jax.jit(loop.make_run_explorer(config, env).act_uniformly)
-
-
-def _on_host(config: RunConfig, env: Environment) -> Environment:
-    """The same environment with its physics on the host, where it has the choice: there nothing is compiled."""
-    import envs
-    from experiments import loop
-
-    if env.backend != "mjx" or config.env not in envs.FACTORIES:
-        return env
-    return loop.make_environment(dataclasses.replace(config, backend="mujoco"))
 
 
 def _check_view(env: Environment, name: str) -> None:
