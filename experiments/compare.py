@@ -8,7 +8,7 @@ import dataclasses
 import json
 import statistics
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,15 +16,23 @@ import numpy as np
 from scipy import stats
 
 from envs.base import Coverage
-from experiments import plot
+from experiments import plot, posterior
 from experiments.config import RunConfig
 from experiments.errors import RunError, disk_error
 from experiments.log import duration, read_metrics
 from experiments.loop import make_environment, read_config
 from experiments.report import series
+from jaxplore.methods import get_method, reward_unit
 
 POINTS = 100
 """Points of a comparison, evenly spaced: runs of different rounds meet there."""
+
+
+MEASURES = (
+    *("intrinsic_reward", "intrinsic_reward_p95", "policy/imagined_reward", "policy/imagined_reward_p95"),
+    *("variance", "variance_p95", "divergence", "divergence_p95", "model_error"),
+)
+"""Fields of a run's rows that tell of its belief, on the transitions just met and not learned from yet."""
 
 
 class Outcome(NamedTuple):
@@ -37,6 +45,10 @@ class Outcome(NamedTuple):
     """The step (end of its round) at which each further cell was seen: the first entry is the first cell's."""
     minutes: float
     """Wall time of the run that the seed was part of."""
+    measures: dict[str, float]
+    """`MEASURES`, those that there are: means over the rounds of the second half."""
+    posterior: dict[str, Any] | None
+    """What `experiments.posterior` found of this seed at this step, if it was asked."""
 
 
 class Group(NamedTuple):
@@ -48,6 +60,8 @@ class Group(NamedTuple):
     """`[T]`"""
     coverage: np.ndarray
     """`[S, T]`, 0 to 1."""
+    variance: np.ndarray
+    """Equation 1 on the transitions just met, whatever the method's own reward, `[S, T]`; NaN without a belief."""
 
 
 class Interval(NamedTuple):
@@ -91,15 +105,30 @@ def load(run: Path, until: int | None = None) -> tuple[RunConfig, list[dict[str,
     return dataclasses.replace(config, steps=until), [row for row in rows if row["step"] <= until]
 
 
-def outcomes(config: RunConfig, rows: Sequence[dict[str, Any]]) -> list[Outcome]:
+def outcomes(config: RunConfig, rows: Sequence[dict[str, Any]], run: Path) -> list[Outcome]:
     """What became of each seed of a run."""
-    found = []
+    found, asked = [], _read_posterior(run, config.steps)
     for seed in range(config.seed, config.seed + config.num_seeds):
         own = [row for row in rows if row["seed"] == seed]
         cells = own[-1]["cells"]
         reached = tuple(next(row["step"] for row in own if row["cells"] >= count) for count in range(1, cells + 1))
-        found.append(Outcome(seed, cells, reached, own[-1]["wall_time"] / 60))
+        late = [row for row in own if 2 * row["step"] > config.steps]
+        measures = {name: [row[name] for row in late if row.get(name) is not None] for name in MEASURES}
+        means = {name: float(np.mean(values)) for name, values in measures.items() if values}
+        found.append(Outcome(seed, cells, reached, own[-1]["wall_time"] / 60, means, asked.get(seed)))
     return found
+
+
+def _read_posterior(run: Path, step: int) -> dict[int, dict[str, Any]]:
+    """By seed what was found at this step; empty where nobody asked, or at another step."""
+    path = run / posterior.FILE
+    if not path.exists():
+        return {}
+    try:
+        asked = json.loads(path.read_text())
+        return {one["seed"]: one for one in asked["seeds"]} if asked["step"] == step else {}
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RunError(f"cannot read {path}: {error!r}. What to do: python -m experiments.posterior {run}") from error
 
 
 def group(
@@ -128,7 +157,7 @@ def group(
     groups = []
     for label in labels:
         own: list[Outcome] = []
-        curves = []
+        curves, variances = [], []
         for run, name, (config, rows) in zip(runs, named, loaded, strict=True):
             if (config.env, config.steps) != (first.env, first.steps):
                 raise RunError(
@@ -140,14 +169,15 @@ def group(
             steps, covered = series(rows, "coverage")
             at = np.searchsorted(steps, grid, side="right") - 1
             curves.append(covered[:, at])
-            own += outcomes(config, rows)
+            variances.append(series(rows, "variance")[1][:, at])
+            own += outcomes(config, rows, run)
         seeds = [outcome.seed for outcome in own]
         if len(set(seeds)) < len(seeds):
             raise RunError(
                 f"{label}: seed {statistics.mode(seeds)} comes twice. Give each seed of a method once, "
                 "or NAME=RUN to compare settings."
             )
-        groups.append(Group(label, own, grid, np.concatenate(curves)))
+        groups.append(Group(label, own, grid, np.concatenate(curves), np.concatenate(variances)))
     return first, groups
 
 
@@ -155,19 +185,82 @@ def table(groups: Sequence[Group], coverage: Coverage) -> str:
     """A Markdown table: medians, ranges in brackets, and the mean height of the coverage curves with its interval."""
     most = coverage.reachable or coverage.num_cells
     seen = f"{coverage.unit} of {coverage.size}: median (range)"
-    lines = [
-        f"| method | seeds | {seen} | each seed | all seen at step | coverage over the run: mean, 95 % | minutes |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
-    ]
+    head = ("method", "seeds", seen, "each seed", "all seen at step", "coverage over the run: mean, 95 %", "minutes")
+    lines = []
     for one in groups:
         cells = [outcome.cells for outcome in one.outcomes]
         whole = [f"{outcome.reached[-1]:,}" for outcome in one.outcomes if outcome.cells == most]
-        minutes = statistics.median(outcome.minutes for outcome in one.outcomes)
         lines.append(
-            f"| `{one.label}` | {len(cells)} | {statistics.median(cells):g} ({min(cells)} to {max(cells)}) "
-            f"| {', '.join(map(str, cells))} | {', '.join(whole) or '-'} | {_percent(one)} | {minutes:.1f} |"
+            (
+                *(f"`{one.label}`", str(len(cells)), f"{statistics.median(cells):g} ({min(cells)} to {max(cells)})"),
+                *(", ".join(map(str, cells)), ", ".join(whole) or "-", _percent(one)),
+                f"{statistics.median(outcome.minutes for outcome in one.outcomes):.1f}",
+            )
         )
-    return "\n".join(lines)
+    return str(_markdown(head, lines))
+
+
+def belief_table(groups: Sequence[Group]) -> str | None:
+    """A Markdown table of what the beliefs said in the second half of the runs, means over seeds; None without any."""
+    pairs = (
+        ("own reward, imagined", "policy/imagined_reward"),
+        ("own reward", "intrinsic_reward"),
+        ("variance", "variance"),
+        ("divergence", "divergence"),
+    )
+    head = ("method", "model error", *(f"{title}: mean, 95th percentile" for title, _ in pairs))
+    lines = []
+    for one in groups:
+        means = {name: _mean([outcome.measures.get(name) for outcome in one.outcomes]) for name in MEASURES}
+        if means["model_error"] is not None:
+            shown = (f"{_number(means[name])}, {_number(means[f'{name}_p95'])}" for _, name in pairs)
+            lines.append((f"`{one.label}`", _number(means["model_error"]), *shown))
+    return _markdown(head, lines)
+
+
+def calibration_table(groups: Sequence[Group]) -> str | None:
+    """A Markdown table of what `experiments.posterior` found, geometric means of ratios and means of the rest over the
+    seeds that were asked; None where none was.
+    """
+    kinds = (("data", posterior.DATA), ("new", posterior.HELD_OUT), ("unseen", posterior.UNSEEN))
+    head = (
+        *("method", "seeds"),
+        *(f"error / variance, {short}" for short, _ in kinds),
+        *(f"rank correlation, {short}" for short, _ in kinds),
+        "unseen told from data",
+    )
+    lines = []
+    for one in groups:
+        asked = [outcome.posterior for outcome in one.outcomes if outcome.posterior]
+        if not asked:
+            continue
+        sets = [[found["sets"].get(kind, {}) for found in asked] for _, kind in kinds]
+        ratios = [[found.get("error_per_variance") for found in kind] for kind in sets]
+        told = _mean([found["unseen_told_from_data"] for found in asked])
+        lines.append(
+            (
+                *(f"`{one.label}`", str(len(asked))),
+                *(_number(_mean([value and float(np.log(value)) for value in kind], np.exp)) for kind in ratios),
+                *(_number(_mean([found.get("rank") for found in kind])) for kind in sets),
+                "-" if told is None else f"{told:.0%}",
+            )
+        )
+    return _markdown(head, lines)
+
+
+def _markdown(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str | None:
+    rows = (head, ["---"] * len(head), *lines)
+    return "\n".join(f"| {' | '.join(row)} |" for row in rows) if lines else None
+
+
+def _mean(values: Sequence[float | None], then: Callable[[float], float] = float) -> float | None:
+    """Mean of the values that there are."""
+    known = [value for value in values if value is not None]
+    return then(float(np.mean(known))) if known else None
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2g}" if abs(value) < 100 else f"{value:,.0f}"
 
 
 def _percent(one: Group) -> str:
@@ -176,12 +269,12 @@ def _percent(one: Group) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Print the table, write `coverage.png` and `comparison.json`; the exit status is 0, or 1 with a message."""
+    """Print tables, write pictures and `comparison.json`; the exit status is 0, or 1 with a message."""
     parser = argparse.ArgumentParser(prog="python -m experiments.compare", description=__doc__)
     parser.add_argument(
         "runs", nargs="+", metavar="[NAME=]RUN", help="directories of finished runs, grouped by NAME, or by method"
     )
-    parser.add_argument("--out", type=Path, required=True, help="directory for coverage.png and comparison.json")
+    parser.add_argument("--out", type=Path, required=True, help="directory for the pictures and comparison.json")
     parser.add_argument("--until", type=int, help="compare the first so many steps of each run (default: all)")
     arguments = parser.parse_args(argv)
     if arguments.until is not None and arguments.until < 1:
@@ -195,6 +288,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         plot.plot_coverage(
             arguments.out / "coverage.png", curves, env.coverage, episode_steps=env.spec.episode_steps, title=config.env
         )
+        told = [plot.Curves(one.label, one.steps, one.variance) for one in groups if np.isfinite(one.variance).any()]
+        if told:
+            unit = reward_unit(get_method("implicit"), config.explorer)
+            plot.plot_intrinsic_reward(
+                arguments.out / "variance.png",
+                told,
+                unit=f"equation 1 on new transitions ({unit})",
+                title=f"{config.env}: what the models disagree on",
+            )
         found = {one.label: [outcome._asdict() for outcome in one.outcomes] for one in groups}
         record = {"env": config.env, "preset": config.preset, "steps": config.steps, "methods": found}
         (arguments.out / "comparison.json").write_text(json.dumps(record, indent=2) + "\n")
@@ -204,7 +306,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         print(f"error: {disk_error('write the comparison', arguments.out, error)}", file=sys.stderr)
         return 1
-    print(table(groups, env.coverage))
+    shown = [table(groups, env.coverage), belief_table(groups), calibration_table(groups)]
+    print("\n\n".join(text for text in shown if text))
     total = sum(outcome.minutes for one in groups for outcome in one.outcomes)
     print(f"\n{duration(60 * total)} of wall time in all; written to {arguments.out}")
     return 0

@@ -99,7 +99,7 @@ def calibration(judged: Judged) -> Calibration | None:
         variance=variance,
         error_per_variance=error / variance if variance > 0 else None,
         error_per_predictive=error / predictive if predictive > 0 else None,
-        rank=None if constant else float(stats.spearmanr(judged.variance, judged.error).statistic),
+        rank=None if constant else float(stats.spearmanr(judged.variance, judged.error)[0]),  # pyright: ignore[reportArgumentType]
     )
 
 

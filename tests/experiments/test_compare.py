@@ -43,7 +43,8 @@ def test_table_and_files(runs: list[Path], tmp_path: Path, capsys: pytest.Captur
     assert "| `random` | 1 | 3 (3 to 3) | 3 | - | 34% | 1.0 |" in lines
     record = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert record["methods"]["implicit"][1]["reached"] == [25, 50, 75, 100, 125, 150, 700]
-    assert record["methods"]["random"][0] == {"seed": 0, "cells": 3, "reached": [25, 50, 625], "minutes": 1.0}
+    random = {"seed": 0, "cells": 3, "reached": [25, 50, 625], "minutes": 1.0, "measures": {}, "posterior": None}
+    assert record["methods"]["random"][0] == random
     assert (tmp_path / "out" / "coverage.png").stat().st_size > 10_000
 
 
@@ -118,3 +119,39 @@ def test_refuses_a_run_that_has_not_finished(runs: list[Path], tmp_path: Path, c
     metrics.write_text("".join(metrics.read_text().splitlines(keepends=True)[:10]))
     assert compare.main([str(runs[0]), f"--out={tmp_path / 'out'}"]) == 1
     assert "stands at step 250 of 1000. Finish it with --resume" in capsys.readouterr().err
+
+
+def add_belief(run: Path, error: float, ratio: float, told: float | None, step: int = 1_000) -> None:
+    """A belief that did nothing in the first half of its run, and what it was found to know at `step`."""
+    path = run / "metrics.jsonl"
+    rows = [json.loads(line) for line in path.read_text().splitlines()]
+    for row in rows:
+        late = row["step"] > 500
+        row |= {"model_error": error if late else 99.0, "variance": 2.0 if late else 50.0, "variance_p95": 3.0}
+    path.write_text("".join(json.dumps(row) + "\n" for row in rows))
+    sets = {"its data": {"error_per_variance": ratio, "rank": 0.5}, "new, its own policy": {"rank": None}}
+    found = {"step": step, "seeds": [{"seed": row["seed"], "sets": sets, "unseen_told_from_data": told}]}
+    (run / "posterior.json").write_text(json.dumps(found))
+
+
+def test_beliefs_are_told_of_where_there_are_any(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture):
+    add_belief(runs[0], 0.5, 2.0, 0.9)
+    add_belief(runs[1], 1.5, 8.0, None)
+    add_belief(runs[2], 1.0, 8.0, 0.5, step=500)  # asked half-way: that is not what is compared
+    assert compare.main([*map(str, runs), f"--out={tmp_path / 'out'}"]) == 0
+    told, belief, calibration, total = capsys.readouterr().out.split("\n\n")
+    assert len(told.splitlines()) == 4
+    assert belief.splitlines()[2:] == ["| `implicit` | 1 | -, - | -, - | 2, 3 | -, - |"]
+    # two of three were asked; a ratio of 2 and one of 8 are 4 on average
+    assert calibration.splitlines()[2:] == ["| `implicit` | 2 | 4 | - | - | 0.5 | - | - | 90% |"]
+    assert total.startswith("4 min 00 s of wall time")
+    assert (tmp_path / "out" / "variance.png").stat().st_size > 10_000
+    record = json.loads((tmp_path / "out" / "comparison.json").read_text())["methods"]["implicit"]
+    assert record[1]["measures"]["model_error"] == 1.5 and record[1]["posterior"]["seed"] == 1
+    assert record[2]["posterior"] is None
+
+
+def test_a_damaged_answer_is_told(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture):
+    (runs[0] / "posterior.json").write_text("{")
+    assert compare.main([*map(str, runs), f"--out={tmp_path / 'out'}"]) == 1
+    assert f"What to do: python -m experiments.posterior {runs[0]}" in capsys.readouterr().err
