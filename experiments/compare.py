@@ -44,7 +44,7 @@ class Outcome(NamedTuple):
     reached: tuple[int, ...]
     """The step (end of its round) at which each further cell was seen: the first entry is the first cell's."""
     minutes: float
-    """Wall time of the run that the seed was part of."""
+    """Wall time of its run; of seeds carried side by side, each one's share."""
     measures: dict[str, float]
     """`MEASURES`, those that there are: means over the rounds of the second half."""
     posterior: dict[str, Any] | None
@@ -115,7 +115,8 @@ def outcomes(config: RunConfig, rows: Sequence[dict[str, Any]], run: Path) -> li
         late = [row for row in own if 2 * row["step"] > config.steps]
         measures = {name: [row[name] for row in late if row.get(name) is not None] for name in MEASURES}
         means = {name: float(np.mean(values)) for name, values in measures.items() if values}
-        found.append(Outcome(seed, cells, reached, own[-1]["wall_time"] / 60, means, asked.get(seed)))
+        minutes = own[-1]["wall_time"] / 60 / config.num_seeds
+        found.append(Outcome(seed, cells, reached, minutes, means, asked.get(seed)))
     return found
 
 
