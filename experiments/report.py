@@ -70,9 +70,12 @@ def write(config: RunConfig, out: Path, env: Environment) -> str:
     unit = f"intrinsic reward ({reward_unit(get_method(config.method), config.explorer)})"
     plot.plot_intrinsic_reward(files["reward"], [plot.Curves(config.method, steps, reward)], unit=unit, title=title)
     table = summary(rows, size=env.coverage.size, unit=env.coverage.unit, files=files)
-    if env.view is not None:
-        table += f"\n\nTo see it move: python -m experiments.render {shlex.quote(str(out))}"
-    return table
+    further = (
+        ("To see it move", "render", env.view is not None),
+        ("To ask what its models know", "posterior", any("model_error" in row for row in rows)),
+    )
+    hints = [f"{what}: python -m experiments.{name} {shlex.quote(str(out))}" for what, name, fits in further if fits]
+    return "\n\n".join([table, *(["\n".join(hints)] if hints else [])])
 
 
 def _read_walk(path: Path) -> tuple[np.ndarray, np.ndarray]:

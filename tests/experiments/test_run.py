@@ -73,6 +73,12 @@ def test_a_run_leaves_all_its_files_and_no_scraps(finished):
         assert 0.01 < (pixels.mean(-1) < 0.95).mean() < 0.9
 
 
+def test_a_run_ends_with_what_can_be_done_next(finished):
+    *_, move, ask = finished.stdout.splitlines()
+    assert move == f"To see it move: python -m experiments.render {finished.out}"
+    assert ask == f"To ask what its models know: python -m experiments.posterior {finished.out}"
+
+
 def test_the_walk_is_where_each_step_began(finished):
     with np.load(finished.out / "walk.npz") as walk:
         positions, episode_steps = walk["positions"], walk["episode_steps"]
