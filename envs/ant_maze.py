@@ -25,6 +25,7 @@ import numpy as np
 
 from envs.base import Environment, EnvSpec, FloorPlan, Task, choose_engine
 from envs.coverage import make_box_coverage
+from envs.views import light_gymnasium_floor
 from jaxplore.types import Array, Key
 
 FRAME_SKIP = 5
@@ -130,15 +131,7 @@ def make_model() -> mujoco.MjModel:
 
 def _light(spec: mujoco.MjSpec) -> None:
     """What only pictures need: colours, lights and two cameras. Physics does not see it."""
-    spec.visual.global_.offwidth = spec.visual.global_.offheight = 1280
-    spec.visual.headlight.ambient = (0.35, 0.35, 0.35)
-    spec.visual.headlight.diffuse = (0.25, 0.25, 0.25)
-    for light in spec.lights:
-        light.diffuse = (0.45, 0.45, 0.45)
-    checker, floor = spec.texture("texplane"), spec.material("MatPlane")
-    checker.rgb1, checker.rgb2 = (0.93, 0.94, 0.95), (0.82, 0.84, 0.86)
-    floor.texrepeat, floor.reflectance, floor.specular = (40, 40), 0.0, 0.0  # Squares of 1 m.
-    spec.geom("floor").rgba = (1.0, 1.0, 1.0, 1.0)
+    light_gymnasium_floor(spec)
     for index in range(len(WALLS)):
         spec.geom(f"wall_{index}").rgba = (0.20, 0.34, 0.56, 0.5)
     for index in range(len(SIDES)):

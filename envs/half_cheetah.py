@@ -22,6 +22,7 @@ import mujoco
 
 from envs.base import Environment, EnvSpec, Task, choose_engine
 from envs.coverage import make_grid_coverage
+from envs.views import light_gymnasium_floor
 from jaxplore.types import Array, Key
 
 FRAME_SKIP = 5
@@ -86,16 +87,11 @@ def make_model() -> mujoco.MjModel:
 
 def _light(spec: mujoco.MjSpec) -> None:
     """What only pictures need: colours, lights and two cameras. Physics does not see it."""
-    spec.visual.global_.offwidth = spec.visual.global_.offheight = 1280
-    spec.visual.headlight.ambient = (0.35, 0.35, 0.35)
-    spec.visual.headlight.diffuse = (0.25, 0.25, 0.25)
+    light_gymnasium_floor(spec)
     for light in spec.lights:
-        light.diffuse, light.castshadow = (0.45, 0.45, 0.45), False  # It is too low: its shadows end in midair.
-    sky, checker, floor = spec.textures[0], spec.texture("texplane"), spec.material("MatPlane")
+        light.castshadow = False  # It is too low: its shadows end in midair.
+    sky = spec.textures[0]
     sky.rgb1, sky.rgb2 = (0.96, 0.97, 0.98), (0.75, 0.79, 0.84)
-    checker.rgb1, checker.rgb2 = (0.93, 0.94, 0.95), (0.82, 0.84, 0.86)
-    floor.texrepeat, floor.reflectance, floor.specular = (40, 40), 0.0, 0.0  # Squares of 1 m.
-    spec.geom("floor").rgba = (1.0, 1.0, 1.0, 1.0)
     track = spec.camera("track")
     track.pos, track.alt.xyaxes = (0, -3, 0.8), (1, 0, 0, 0, 0.26, 0.97)
     spec.worldbody.add_camera(name="side", pos=(0, -8, 1.9), xyaxes=(1, 0, 0, 0, 0.2, 0.98), fovy=40)

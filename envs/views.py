@@ -38,6 +38,21 @@ def make_mujoco_view(model: Any, qpos: Callable[[EnvState], Any], cameras: tuple
     return View(frames, usual, True)
 
 
+def light_gymnasium_floor(spec: Any) -> None:
+    """Softer light, and a pale floor of 1 m squares, for a `mujoco.MjSpec` made from one of Gymnasium's files. For
+    pictures only: physics does not see it.
+    """
+    spec.visual.global_.offwidth = spec.visual.global_.offheight = 1280
+    spec.visual.headlight.ambient = (0.35, 0.35, 0.35)
+    spec.visual.headlight.diffuse = (0.25, 0.25, 0.25)
+    for light in spec.lights:
+        light.diffuse = (0.45, 0.45, 0.45)
+    checker, floor = spec.texture("texplane"), spec.material("MatPlane")
+    checker.rgb1, checker.rgb2 = (0.93, 0.94, 0.95), (0.82, 0.84, 0.86)
+    floor.texrepeat, floor.reflectance, floor.specular = (40, 40), 0.0, 0.0
+    spec.geom("floor").rgba = (1.0, 1.0, 1.0, 1.0)
+
+
 def make_sketch_view(limits: tuple[float, float, float, float], draw: Callable[[Any, EnvState], None]) -> View:
     """Drawn with matplotlib, on empty axes of equal scale.
 
