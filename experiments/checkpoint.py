@@ -118,13 +118,14 @@ class Checkpoints:
         except OSError as error:
             self._warn(f"cannot remove old checkpoints in {self.directory}: {error.strerror}")
 
-    def restore_latest(self, abstract_state: Any) -> Restored | None:
+    def restore_latest(self, abstract_state: Any, until: int | None = None) -> Restored | None:
         """Reads the newest checkpoint that is whole. Deletes nothing, so another process may look at a running run.
 
         Args:
             abstract_state: a state with the structure, shapes and dtypes of the saved one: a fresh one, or what
                 `jax.eval_shape` makes of it. JAX arrays come back as JAX arrays (spread over devices like those given
                 here), NumPy arrays as NumPy arrays whatever `jax_enable_x64` says, typed keys as typed keys.
+            until: a step; checkpoints of later ones are passed over.
 
         Returns:
             The step, the state and the meta; None if there is no checkpoint.
@@ -133,7 +134,7 @@ class Checkpoints:
             RunError: there are checkpoints but none is whole, or the saved state does not fit `abstract_state`.
         """
         reasons = []
-        for step in reversed(self.steps()):
+        for step in reversed([step for step in self.steps() if until is None or step <= until]):
             path = self.directory / str(step)
             try:
                 manifest = _verify(path)

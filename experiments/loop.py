@@ -285,14 +285,18 @@ def read_config(out: Path) -> RunConfig:
         raise RunError(f"{out} holds no run: cannot read {path} ({reason}).") from error
 
 
-def last_state(out: Path, config: RunConfig, env: Environment, explorer: Explorer) -> tuple[RunState, int]:
-    """The state in the latest checkpoint of the run in `out`, and its step.
+def last_state(
+    out: Path, config: RunConfig, env: Environment, explorer: Explorer, until: int | None = None
+) -> tuple[RunState, int]:
+    """The state in the latest checkpoint of the run in `out`, up to the step `until` if that is given, and its step.
 
     Raises:
-        RunError: there is no checkpoint, or none that fits the configuration.
+        RunError: there is no such checkpoint, or none that fits the configuration.
     """
-    init = make_programs(config, env, explorer).init
-    restored = Checkpoints(out / "checkpoints").restore_latest(jax.eval_shape(init) if env.compiled else init())
+    init, checkpoints = make_programs(config, env, explorer).init, Checkpoints(out / "checkpoints")
+    restored = checkpoints.restore_latest(jax.eval_shape(init) if env.compiled else init(), until)
+    if restored is None and checkpoints.steps():
+        raise RunError(f"{out} has no checkpoint up to step {until}, only of {checkpoints.steps()}.")
     if restored is None:
         raise RunError(f"{out} has no checkpoint yet: let the run go on for {config.checkpoint_every:,} steps.")
     return restored.state, restored.step

@@ -238,8 +238,11 @@ def record(judged: dict[str, Judged], env: Environment) -> dict[str, Any]:
     return found
 
 
-def write(run: Path) -> str:
-    """Ask the belief of the run in `run`, write `posterior.json` and `posterior.png` there, and give the table.
+def write(run: Path, until: int | None = None) -> str:
+    """Ask the belief of the run in `run`, as it stood at its last checkpoint or the last one up to the step `until`.
+
+    Returns:
+        A table; `posterior.json` and `posterior.png` are written to `run`.
 
     Raises:
         RunError: there is no run, no checkpoint, or no writing.
@@ -248,7 +251,7 @@ def write(run: Path) -> str:
     config = loop.read_config(run)
     own_env = loop.make_environment(config)
     explorer = loop.make_run_explorer(config, own_env)
-    state, step = loop.last_state(run, config, own_env, explorer)
+    state, step = loop.last_state(run, config, own_env, explorer, until)
     env = loop.on_host(config, own_env)
     seeds, lines = [], []
     first: dict[str, Judged] = {}
@@ -304,13 +307,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Ask each run; the exit status is 0, 1 with a message, or 2 for bad input."""
     parser = argparse.ArgumentParser(prog="python -m experiments.posterior", description=__doc__)
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="directories of runs with a checkpoint")
+    parser.add_argument("--until", type=int, help="ask at the latest checkpoint up to this step (default: the last)")
     arguments = parser.parse_args(argv)
     from experiments.run import use_compilation_cache
 
     use_compilation_cache()
     try:
         for run in arguments.runs:
-            print(write(run) + "\n", flush=True)
+            print(write(run, arguments.until) + "\n", flush=True)
     except (RunError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

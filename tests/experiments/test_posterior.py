@@ -135,6 +135,16 @@ def test_asking_again_gives_the_same(asked: Path):
     assert (asked / "posterior.json").read_text() == before
 
 
+def test_an_earlier_checkpoint_can_be_asked(asked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = tmp_path / "run"
+    shutil.copytree(asked, out)
+    assert posterior.main([str(out), "--until=80"]) == 0
+    text = json.loads((out / "posterior.json").read_text())
+    assert (text["step"], text["seeds"][0]["sets"][posterior.DATA]["num"]) == (75, 75)
+    assert posterior.main([str(out), "--until=74"]) == 1
+    assert "no checkpoint up to step 74, only of [75, 81]" in capsys.readouterr().err
+
+
 def test_says_why_not(tell, point: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert posterior.main([str(tmp_path)]) == 1
     assert "holds no run" in capsys.readouterr().err
