@@ -295,8 +295,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             plot.plot_intrinsic_reward(
                 arguments.out / "variance.png",
                 told,
-                unit=f"equation 1 on new transitions ({unit})",
-                title=f"{config.env}: what the models disagree on",
+                unit=f"equation 1 ({unit})",
+                title=f"{config.env}: variance of the models on the transitions just met",
             )
         found = {one.label: [outcome._asdict() for outcome in one.outcomes] for one in groups}
         record = {"env": config.env, "preset": config.preset, "steps": config.steps, "methods": found}

@@ -127,8 +127,7 @@ def plot_coverage(
             for values in group.values:
                 width, alpha = (0.9, faint) if many else (2.2, 1.0)
                 axes.plot(group.steps, values, color=colour, linewidth=width, alpha=alpha, drawstyle="steps-post")
-            label = f"{group.label}, {'median of ' if many else ''}n = {len(group.values)}"
-            middle = np.median(group.values, axis=0)
+            middle, label = np.median(group.values, axis=0), _label(group, curves)
             axes.plot(group.steps, middle, dashes, color=colour, linewidth=2.4, drawstyle="steps-post", label=label)
         axes.set_ylim(0, 1.04)
         axes.yaxis.set_major_locator(FixedLocator([0, 0.2, 0.4, 0.6, 0.8, 1]))
@@ -183,8 +182,9 @@ def plot_intrinsic_reward(
             for values in group.values:
                 axes.plot(group.steps, values, color=colour, linewidth=0.7, alpha=0.35)
             window = len(group.steps) // 50 * 2 + 1
-            label = f"{group.label}, {'median of ' if len(group.values) > 1 else ''}n = {len(group.values)}"
-            label += f" (bold: mean of {window} rounds)" if window > 1 else ""
+            label = _label(group, curves)
+            if window > 1 and len(curves) <= MOST_IN_PICTURE:
+                label += f" (bold: mean of {window} rounds)"
             middle = _smooth(_median(group.values), window)
             axes.plot(group.steps, middle, dashes, color=colour, linewidth=2.4, label=label)
         positive = np.concatenate([values[values > 0] for values in drawn])
@@ -370,6 +370,14 @@ def _colours(curves: Sequence[Curves]) -> list[tuple[str, str]]:
     return [(_COLOURS[i % count], styles[i // count % len(styles)]) for i in range(len(curves))]
 
 
+def _label(group: Curves, curves: Sequence[Curves]) -> str:
+    """What a line is called; short where there are many, as the legend's title says the rest."""
+    count = len(group.values)
+    if len(curves) > MOST_IN_PICTURE:
+        return f"{group.label}, {count}"
+    return f"{group.label}, {'median of ' if count > 1 else ''}n = {count}"
+
+
 def _median(values: np.ndarray) -> np.ndarray:
     """The median over seeds, `[S, T] -> [T]`, of those that have a value; NaN where none has."""
     middle = np.full(values.shape[1], np.nan)
@@ -394,8 +402,9 @@ def _finish(
     axes.set_xlabel("environment steps")
     if axes.get_legend_handles_labels()[0]:
         if len(curves) > MOST_IN_PICTURE:
-            figure.set_figwidth(figure.get_figwidth() * 1.4)
-            figure.legend(loc="outside right upper", frameon=False)
+            figure.set_figwidth(figure.get_figwidth() * 1.3)
+            title_of_legend = "median, of so many seeds"
+            figure.legend(loc="outside right upper", frameon=False, title=title_of_legend, alignment="left")
         else:
             axes.legend(loc=legend, frameon=True, framealpha=0.9, edgecolor="none")
     if title:

@@ -163,4 +163,5 @@ def test_many_groups_are_told_apart_and_named_beside_the_picture(tmp_path: Path,
     assert len({(line.get_color(), line.get_linestyle()) for line in bold}) == 10
     assert axes.get_legend() is None
     (legend,) = figures[0].legends
-    assert [text.get_text() for text in legend.get_texts()] == [f"method {i}, median of n = 2" for i in range(10)]
+    assert [text.get_text() for text in legend.get_texts()] == [f"method {i}, 2" for i in range(10)]
+    assert legend.get_title().get_text() == "median, of so many seeds"
