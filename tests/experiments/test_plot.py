@@ -157,7 +157,7 @@ def test_many_groups_are_told_apart_and_named_beside_the_picture(tmp_path: Path,
     steps = np.arange(1, 5) * 25
     curves = [Curves(f"method {i}", steps, np.full((2, 4), i / 10)) for i in range(10)]
     plot_coverage(tmp_path / "c.png", curves, COVERAGE)
-    check_picture(tmp_path / "c.png", 1600)
+    check_picture(tmp_path / "c.png", 1500)
     axes = figures[0].axes[0]
     bold = [line for line in axes.get_lines() if str(line.get_label()).startswith("method")]
     assert len({(line.get_color(), line.get_linestyle()) for line in bold}) == 10
