@@ -5,6 +5,7 @@ Runs of one method with different settings are told apart by a name of your own 
 
 import argparse
 import dataclasses
+import gzip
 import json
 import statistics
 import sys
@@ -33,6 +34,30 @@ MEASURES = (
     *("variance", "variance_p95", "divergence", "divergence_p95", "model_error"),
 )
 """Fields of a run's rows that tell of its belief, on the transitions just met and not learned from yet."""
+
+
+KEPT = ("config.json", "versions.json", posterior.FILE)
+"""Files that `keep` copies as they are, those that there are."""
+
+
+def keep(run: Path, directory: Path) -> None:
+    """Copy what a comparison reads of a run, its metrics compressed, to a directory of the run's name: some 30 kB.
+
+    Raises:
+        OSError: it cannot be read or written.
+    """
+    to = directory / run.resolve().name
+    to.mkdir(parents=True, exist_ok=True)
+    if to.resolve() == run.resolve():
+        return
+    for name in KEPT:
+        if (run / name).exists():
+            (to / name).write_bytes((run / name).read_bytes())
+    if (run / "metrics.jsonl").exists():
+        # Without the time of day, so that the same run gives the same bytes.
+        (to / "metrics.jsonl.gz").write_bytes(gzip.compress((run / "metrics.jsonl").read_bytes(), mtime=0))
+    else:
+        (to / "metrics.jsonl.gz").write_bytes((run / "metrics.jsonl.gz").read_bytes())
 
 
 class Outcome(NamedTuple):
@@ -277,6 +302,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--out", type=Path, required=True, help="directory for the pictures and comparison.json")
     parser.add_argument("--until", type=int, help="compare the first so many steps of each run (default: all)")
+    parser.add_argument(
+        "--keep", type=Path, help="also copy what a comparison needs of each run to this directory; they are runs, too"
+    )
     arguments = parser.parse_args(argv)
     if arguments.until is not None and arguments.until < 1:
         parser.error(f"--until={arguments.until}. Allowed: 1 or more.")
@@ -301,6 +329,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         found = {one.label: [outcome._asdict() for outcome in one.outcomes] for one in groups}
         record = {"env": config.env, "preset": config.preset, "steps": config.steps, "methods": found}
         (arguments.out / "comparison.json").write_text(json.dumps(record, indent=2) + "\n")
+        for run in runs if arguments.keep else ():
+            keep(run, arguments.keep)
     except RunError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

@@ -6,12 +6,14 @@ table look for. `metrics.jsonl` is the truth; everything else can be made again 
 """
 
 import contextlib
+import gzip
 import json
 import math
 import os
 import statistics
 import sys
 import time
+import zlib
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -25,14 +27,19 @@ Row = Mapping[str, Any]
 
 
 def read_metrics(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
-    """Reads the rows of a `metrics.jsonl`; a last line that is still being written is left out.
+    """Reads the rows of a `metrics.jsonl` or, where there is none, of a `metrics.jsonl.gz`; a last line that is still
+    being written is left out.
 
     Raises:
         RunError: the file cannot be read, or a line is not a row.
     """
+    packed = Path(f"{os.fspath(path)}.gz")
     try:
-        lines = Path(path).read_bytes().split(b"\n")[:-1]
-    except OSError as error:
+        if packed.exists() and not Path(path).exists():
+            lines = gzip.decompress(packed.read_bytes()).split(b"\n")[:-1]
+        else:
+            lines = Path(path).read_bytes().split(b"\n")[:-1]
+    except (OSError, EOFError, zlib.error) as error:
         raise disk_error("read the metrics", path, error) from error
     return [_parse(line, path, number) for number, line in enumerate(lines, 1)]
 

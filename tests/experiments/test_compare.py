@@ -155,3 +155,27 @@ def test_a_damaged_answer_is_told(runs: list[Path], tmp_path: Path, capsys: pyte
     (runs[0] / "posterior.json").write_text("{")
     assert compare.main([*map(str, runs), f"--out={tmp_path / 'out'}"]) == 1
     assert f"What to do: python -m experiments.posterior {runs[0]}" in capsys.readouterr().err
+
+
+def test_what_is_kept_of_runs_compares_as_they_do(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture):
+    add_belief(runs[0], 0.5, 2.0, 0.9)
+    kept = tmp_path / "kept"
+    assert compare.main([*map(str, runs), f"--out={tmp_path / 'out'}", f"--keep={kept}"]) == 0
+    told = capsys.readouterr().out
+    assert sorted(path.name for path in kept.iterdir()) == ["a", "b", "c", "d"]
+    assert sorted(path.name for path in (kept / "a").iterdir()) == ["config.json", "metrics.jsonl.gz", "posterior.json"]
+    # compared again, and kept again where they are: the same tables, the same bytes
+    before = (kept / "a" / "metrics.jsonl.gz").read_bytes()
+    assert compare.main([*(str(kept / run.name) for run in runs), f"--out={tmp_path / 'two'}", f"--keep={kept}"]) == 0
+    assert capsys.readouterr().out == told.replace(str(tmp_path / "out"), str(tmp_path / "two"))
+    assert (kept / "a" / "metrics.jsonl.gz").read_bytes() == before
+    names = ("comparison.json", "coverage.png")
+    assert all((tmp_path / "out" / name).read_bytes() == (tmp_path / "two" / name).read_bytes() for name in names)
+
+
+def test_damaged_metrics_are_told(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture):
+    compare.keep(runs[0], tmp_path / "kept")
+    packed = tmp_path / "kept" / "a" / "metrics.jsonl.gz"
+    packed.write_bytes(packed.read_bytes()[:-20])
+    assert compare.main([str(packed.parent), f"--out={tmp_path / 'out'}"]) == 1
+    assert "read the metrics" in capsys.readouterr().err
