@@ -20,7 +20,7 @@ from envs.base import Coverage
 from experiments import plot, posterior
 from experiments.config import RunConfig
 from experiments.errors import RunError, disk_error
-from experiments.log import duration, read_metrics
+from experiments.log import duration, number, read_metrics
 from experiments.loop import make_environment, read_config
 from experiments.report import series
 from jaxplore.methods import get_method, reward_unit
@@ -239,8 +239,8 @@ def belief_table(groups: Sequence[Group]) -> str | None:
     for one in groups:
         means = {name: _mean([outcome.measures.get(name) for outcome in one.outcomes]) for name in MEASURES}
         if means["model_error"] is not None:
-            shown = (f"{_number(means[name])}, {_number(means[f'{name}_p95'])}" for _, name in pairs)
-            lines.append((f"`{one.label}`", _number(means["model_error"]), *shown))
+            shown = (f"{number(means[name])}, {number(means[f'{name}_p95'])}" for _, name in pairs)
+            lines.append((f"`{one.label}`", number(means["model_error"]), *shown))
     return _markdown(head, lines)
 
 
@@ -266,8 +266,8 @@ def calibration_table(groups: Sequence[Group]) -> str | None:
         lines.append(
             (
                 *(f"`{one.label}`", str(len(asked))),
-                *(_number(_mean([value and float(np.log(value)) for value in kind], np.exp)) for kind in ratios),
-                *(_number(_mean([found.get("rank") for found in kind])) for kind in sets),
+                *(number(_mean([value and float(np.log(value)) for value in kind], np.exp)) for kind in ratios),
+                *(number(_mean([found.get("rank") for found in kind])) for kind in sets),
                 "-" if told is None else f"{told:.0%}",
             )
         )
@@ -283,10 +283,6 @@ def _mean(values: Sequence[float | None], then: Callable[[float], float] = float
     """Mean of the values that there are."""
     known = [value for value in values if value is not None]
     return then(float(np.mean(known))) if known else None
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2g}" if abs(value) < 100 else f"{value:,.0f}"
 
 
 def _percent(one: Group) -> str:

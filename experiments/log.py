@@ -386,6 +386,11 @@ def summary(
     return "\n".join(text)
 
 
+def number(value: float | None) -> str:
+    """Two digits, or whole numbers from 100 on; `-` for what is not there."""
+    return "-" if value is None else f"{value:.2g}" if abs(value) < 100 else f"{value:,.0f}"
+
+
 def table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     """Right-aligned columns with a rule below their names, as plain text."""
     widths = [max(map(len, column)) for column in zip(head, *lines, strict=True)]

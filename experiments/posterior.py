@@ -23,7 +23,7 @@ from envs.wrappers import Act, make_collect
 from experiments import loop, plot
 from experiments.config import RunConfig
 from experiments.errors import RunError, disk_error
-from experiments.log import table
+from experiments.log import number, table
 from jaxplore import rewards
 from jaxplore.beliefs import Belief
 from jaxplore.dynamics import Normalizers
@@ -267,10 +267,10 @@ def write(run: Path, until: int | None = None) -> str:
                     str(config.seed + index),
                     name,
                     f"{one['num']:,}",
-                    _number(one["error"]),
-                    _number(one["variance"]),
-                    _number(ratio),
-                    _number(one["rank"]),
+                    number(one["error"]),
+                    number(one["variance"]),
+                    number(ratio),
+                    number(one["rank"]),
                 )
             )
     unit = reward_unit(get_method("implicit"), config.explorer)
@@ -297,10 +297,6 @@ def write(run: Path, until: int | None = None) -> str:
     ]
     files = f"written to {run / FILE}, {run / PICTURE}"
     return "\n".join([title, f"unit: {unit}", "", table(head, lines), "", *after, files])
-
-
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
