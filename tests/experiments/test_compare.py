@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from experiments import compare
 from experiments.config import preset_config, to_json
 from experiments.errors import RunError
+from tests.experiments.tiny import ROOT
 
 
 def write_run(path: Path, method: str, seed: int, reached: list[int], steps: int = 1_000) -> Path:
@@ -171,6 +173,17 @@ def test_what_is_kept_of_runs_compares_as_they_do(runs: list[Path], tmp_path: Pa
     assert (kept / "a" / "metrics.jsonl.gz").read_bytes() == before
     names = ("comparison.json", "coverage.png")
     assert all((tmp_path / "out" / name).read_bytes() == (tmp_path / "two" / name).read_bytes() for name in names)
+
+
+def test_committed_runs_are_there_and_are_what_the_readme_shows():
+    kept = ROOT / "experiments/results/runs"
+    _, groups = compare.group([*kept.glob("ant-implicit-s?"), *kept.glob("ant-random")], until=4_000)
+    readme = (ROOT / "README.md").read_text()
+    for one in groups:
+        assert len(one.outcomes) == 5
+        mean, half_width = compare.interval(one.coverage.mean(axis=1))
+        shown = f"{mean:.0%} +- {100 * half_width:.0f}"
+        assert re.search(rf"^\| `{one.label}` \| [\d, ]+ \| {re.escape(shown)} \|", readme, re.M)
 
 
 def test_damaged_metrics_are_told(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture):
