@@ -1,4 +1,4 @@
-"""What holds for every test: no silent rank promotion, two CPU devices, programs compiled quickly and kept between runs.
+"""What holds for every test: no silent rank promotion, two CPU devices, programs compiled fast and kept between runs.
 
 Warnings are errors too; `pyproject.toml` says so, and which of other packages' warnings are let through.
 """
