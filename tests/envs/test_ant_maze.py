@@ -282,7 +282,7 @@ class TestEpisode:
         assert flags[299:] == [(False, True)] * 2
 
     def test_device_counts_alike(self, device, device_step):
-        states = jax.vmap(device.reset)(jax.random.split(jax.random.key(0), BATCH))
+        states = jax.jit(jax.vmap(device.reset))(jax.random.split(jax.random.key(0), BATCH))
         states = states.replace(num_steps=jnp.arange(295, 303, dtype=jnp.int32))
         states, transitions = device_step(states, jnp.zeros((BATCH, 8)))
         np.testing.assert_array_equal(transitions.truncated, np.arange(296, 304) >= 300)
