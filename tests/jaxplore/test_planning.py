@@ -140,11 +140,16 @@ def fitted():
     return answers(jax.random.split(jax.random.key(0), 16))
 
 
+def variances(fitted):
+    """Of each generator and pair, `[16, 8]`."""
+    return jax.vmap(lambda means: rewards.variance(Prediction(means)))(fitted)
+
+
 def test_predictions_are_probabilities(fitted):
     # over states they sum to one, none is negative, and the variance of such is below 1
     np.testing.assert_allclose(jnp.sum(fitted, axis=-1), 1.0, rtol=1e-5)
     assert float(jnp.min(fitted)) >= 0.0
-    assert float(jnp.max(jax.vmap(lambda means: rewards.variance(Prediction(means)))(fitted))) < 1.0
+    assert float(jnp.max(variances(fitted))) < 1.0
 
 
 def test_fit_learns_the_chain_and_is_least_sure_of_what_it_has_not_seen(fitted):
@@ -153,7 +158,7 @@ def test_fit_learns_the_chain_and_is_least_sure_of_what_it_has_not_seen(fitted):
     _, _, after = chain()
     likely = ONE_HOT.next_obs(NORMALIZERS, jnp.zeros(()), fitted[:, :, :7])
     assert float(jnp.mean(jnp.sum(likely * after[None, None, :7], axis=-1))) > 0.95
-    spread = np.mean(jax.vmap(lambda means: rewards.variance(Prediction(means)))(fitted), axis=0)
+    spread = np.mean(variances(fitted), axis=0)
     assert np.argmax(spread) == 7 and spread[7] > 3 * spread[:7].mean()
 
 
