@@ -22,14 +22,14 @@ import envs
 from benchmarks import flops
 from benchmarks.timing import Timing, matmul_rate, measure
 from envs.base import Environment
-from envs.gymnasium_api import gymnasium_id
+from envs.adapters.to_gymnasium import gymnasium_id
 from experiments import loop
 from experiments.config import RunConfig, preset_config
 from experiments.run import use_compilation_cache, versions
 from jaxplore import beliefs, dynamics, imagination, replay, rewards
 from jaxplore.exploration import make_explorer
 from jaxplore.methods import METHODS, ExplorationConfig, Sizes
-from jaxplore.sac import make_sac
+from jaxplore.learners.sac import make_sac
 from jaxplore.types import Transition
 
 RESULTS = Path(__file__).parent / "results"

@@ -1,7 +1,7 @@
 """The environments, by name: `make("ant_maze", obs_noise=0.02)`, `make("gymnasium:Pendulum-v1")`.
 
 See `envs.base` for what an environment is. Importing this package also registers the ones in `FACTORIES` with
-Gymnasium; see `envs.gymnasium_api`.
+Gymnasium; see `envs.adapters.to_gymnasium`.
 """
 
 import functools
@@ -10,8 +10,8 @@ import inspect
 from collections.abc import Callable
 from typing import Any
 
-from envs import gymnasium_api
 from envs.acrobot import make_acrobot
+from envs.adapters import to_gymnasium
 from envs.ant_maze import make_ant_maze
 from envs.base import Coverage, Environment, EnvSpec, EnvState, FloorPlan
 from envs.half_cheetah import make_half_cheetah, make_half_cheetah_task
@@ -31,11 +31,10 @@ FACTORIES: dict[str, Callable[..., Environment]] = {
 }
 """Name of an environment, and what makes it. A new environment is one line here."""
 
-
 ADAPTERS = {
-    "brax": "envs.brax_adapter",
-    "gymnasium": "envs.gymnasium_adapter",
-    "playground": "envs.playground_adapter",
+    "brax": "envs.adapters.from_brax",
+    "gymnasium": "envs.adapters.from_gymnasium",
+    "playground": "envs.adapters.from_playground",
 }
 """Prefix of the names of other packages' environments, and the module that adapts them, imported when it is asked for.
 It has `check_name(name)` and `make_environment(name, **options)`, `name` without the prefix."""
@@ -46,7 +45,7 @@ def check_name(name: str) -> None:
     `gymnasium:Pendulum-v1`, `brax:hopper` or `playground:CartpoleBalance`.
 
     Raises:
-        ValueError: an unknown name or prefix, with the nearest match and what is allowed; or the package is missing,
+        FieldError: an unknown name or prefix, with the nearest match and what is allowed; or the package is missing,
             with what to install.
     """
     find_factory(name)
@@ -59,7 +58,7 @@ def find_factory(name: str) -> Callable[..., Environment]:
         # A name with a colon in it, which this one is not, so it is never taken for known.
         validate.one_of("env", name, [*FACTORIES, *(f"{prefix}:NAME" for prefix in ADAPTERS)])
         return FACTORIES[name]
-    validate.one_of("the package before the colon in env", prefix, ADAPTERS)
+    validate.one_of("env", f"{prefix}:NAME", (f"{known}:NAME" for known in ADAPTERS))
     adapter = importlib.import_module(ADAPTERS[prefix])
     adapter.check_name(own_name)
     return functools.partial(adapter.make_environment, own_name)
@@ -73,7 +72,7 @@ def make(name: str, **options: Any) -> Environment:
         **options: the factory's own arguments, such as `backend` and `obs_noise`.
 
     Raises:
-        ValueError: an unknown name or option, with the nearest match and the list of those that are known; a package
+        FieldError: an unknown name or option, with the nearest match and the list of those that are known; a package
             that is missing; or an option's value that the factory refuses.
     """
     factory = find_factory(name)
@@ -82,7 +81,7 @@ def make(name: str, **options: Any) -> Environment:
     return factory(**options)
 
 
-gymnasium_api.register(FACTORIES)
+to_gymnasium.register(FACTORIES)
 
 __all__ = [
     "ADAPTERS",

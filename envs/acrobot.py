@@ -119,7 +119,7 @@ def make_horizontal_coverage(horizontal: float = HORIZONTAL) -> Coverage:
         horizontal: sine of the angle from hanging that both links must reach, above 0 and at most 1.
 
     Raises:
-        ValueError: `horizontal` is out of range.
+        FieldError: `horizontal` is out of range.
     """
     validate.in_range("horizontal", horizontal, 0.0, 1.0, open_low=True)
 
@@ -166,7 +166,7 @@ def make_acrobot(backend: str = "auto", obs_noise: float = 0.0, horizontal: floa
         horizontal: how horizontal is enough; see `HORIZONTAL`.
 
     Raises:
-        ValueError: an unknown `backend`, an `obs_noise` that is negative or not finite, or `horizontal` out of range.
+        FieldError: an unknown `backend`, an `obs_noise` that is negative or not finite, or `horizontal` out of range.
     """
     validate.one_of("backend", backend, ("auto", BACKEND))
     rules = Rules(

@@ -180,7 +180,7 @@ def make_ant_maze(backend: str = "auto", obs_noise: float = 0.0) -> Environment:
             use 0.02. The simulation does not see it.
 
     Raises:
-        ValueError: an unknown `backend`, or an `obs_noise` that is negative or not finite.
+        FieldError: an unknown `backend`, or an `obs_noise` that is negative or not finite.
     """
     task = Task(
         spec=SPEC,

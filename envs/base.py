@@ -5,8 +5,8 @@ scan as you like) and for those whose physics runs on the host (C MuJoCo; `compi
 state holds NumPy arrays). In both the state is a pytree that holds *everything*: saving it and stepping from it again
 gives the same numbers to the bit.
 
-No environment resets itself. `Transition.next_obs` is always the true successor; whoever collects calls `reset` when
-`terminated` or `truncated` is set (`envs.wrappers` has that loop for both kinds).
+No environment resets itself. `Transition.next_obs` is always the true successor; anyone who collects calls `reset` when
+`terminated` or `truncated` is set (`envs.stepper` has that loop for both kinds).
 """
 
 import importlib
@@ -23,14 +23,15 @@ from flax import struct
 
 from jaxplore import validate
 from jaxplore.types import Array, Key, Transition
+from jaxplore.validate import FieldError
 
 
 @struct.dataclass
 class EnvState:
-    """Everything an environment needs to go on."""
+    """Everything an environment needs to continue."""
 
     physics: Any
-    """The engine's own state: `mjx_backend.MjxState`, C MuJoCo's integration state vector, or what `Rules` hold."""
+    """The engine's own state: `engines.mjx.MjxState`, C MuJoCo's integration state vector, or what `Rules` hold."""
     obs: Array
     """The observation that the agent sees now, `[O]`, float32, with observation noise if there is any."""
     num_steps: Array
@@ -139,7 +140,7 @@ class Environment:
 
 
 class Physics(NamedTuple):
-    """A physics engine with one model in it. The state holds everything it needs to go on to the bit."""
+    """A physics engine with one model in it. The state holds everything it needs to continue, to the bit."""
 
     init: Callable[[Array, Array], Any]
     """`init(qpos [nq], qvel [nv]) -> physics`: at rest otherwise."""
@@ -176,13 +177,14 @@ class Task(NamedTuple):
     """`control(xp, action [A]) -> ctrl [nu]`, of an action in [-1, 1]."""
 
 
-ENGINES = {"mjx": "envs.mjx_backend", "mujoco": "envs.host_backend"}
+ENGINES = {"mjx": "envs.engines.mjx", "mujoco": "envs.engines.host"}
+"""Name of a backend, and the module that runs a `Task` on it, imported when it is asked for."""
 
 
 def choose_engine(backend: str) -> ModuleType:
     """The module that runs a `Task` on `backend`: `"mjx"`, `"mujoco"`, or `"auto"` (MuJoCo on a CPU, else MJX).
 
-    Raises `ValueError` for any other name.
+    Raises `FieldError` for any other name.
     """
     validate.one_of("backend", backend, ("auto", *ENGINES))
     if backend == "auto":
@@ -191,9 +193,8 @@ def choose_engine(backend: str) -> ModuleType:
 
 
 def check_noise(obs_noise: float) -> float:
-    """Returns `obs_noise`. Raises `ValueError` unless it is a finite number of at least 0."""
+    """Returns `obs_noise`. Raises `FieldError` unless it is a finite number of at least 0."""
     if not (isinstance(obs_noise, numbers.Real) and math.isfinite(obs_noise) and obs_noise >= 0):
-        raise ValueError(
-            f"obs_noise is {obs_noise!r}. Allowed: a finite standard deviation of at least 0, in raw units."
-        )
+        allowed = "a finite standard deviation of at least 0, in raw units"
+        raise FieldError("obs_noise", obs_noise, allowed, "is out of range")
     return float(obs_noise)

@@ -23,6 +23,7 @@ import numpy as np
 from envs.base import Coverage, EnvSpec
 from jaxplore import validate
 from jaxplore.types import Array
+from jaxplore.validate import FieldError
 
 MAX_CELLS = 1_000_000
 """Cells that a grid may have: a run keeps and saves one byte for each."""
@@ -75,7 +76,7 @@ def make_grid_coverage(
         reachable: how many of the cells can be reached, where that is known.
 
     Raises:
-        ValueError: no entry, one that is negative or named twice, an end too many or too few or not finite, `low` not
+        FieldError: no entry, one that is negative or named twice, an end too many or too few or not finite, `low` not
             below `high`, `bins` below 1, or more than `MAX_CELLS` cells.
 
     Example:
@@ -87,18 +88,18 @@ def make_grid_coverage(
     dims = tuple(dims)
     counts = (bins,) * len(dims) if isinstance(bins, int) else tuple(bins)
     if not dims or len(set(dims)) < len(dims):
-        raise ValueError(f"dims={dims!r}. Allowed: one or more entries of the observation, each once.")
+        raise FieldError("dims", dims, "one or more entries of the observation, each once")
     for dim in dims:
         validate.at_least("dims", dim, 0)
     for name, values in (("low", low), ("high", high), ("bins", counts)):
         if len(values) != len(dims):
-            raise ValueError(f"{name}={values!r}. Allowed: {len(dims)} numbers, one for each of dims={dims!r}.")
+            raise FieldError(name, values, f"{len(dims)} numbers, one for each of dims={dims!r}")
     for count, lowest, highest in zip(counts, low, high, strict=True):
         validate.at_least("bins", count, 1)
         validate.in_range("low", lowest)
         validate.in_range("high", highest, lowest, open_low=True)
     if math.prod(counts) > MAX_CELLS:
-        raise ValueError(f"bins={counts!r} are {math.prod(counts):,} cells. Allowed: at most {MAX_CELLS:,}.")
+        raise FieldError("bins", counts, f"at most {MAX_CELLS:,}", f"are {math.prod(counts):,} cells")
     borders = [np.linspace(*ends) for ends in zip(low, high, np.add(counts, 1).tolist(), strict=True)]
 
     def cell(obs: Array) -> Array:
@@ -133,11 +134,11 @@ def make_entries_coverage(spec: EnvSpec, entries: Sequence[str] | Sequence[int])
         entries: indices of entries, from 0, or their names with or without the unit (`"x"` for `"x [m]"`).
 
     Raises:
-        ValueError: no entry, more than three, one named twice, or one that there is not; with those that there are.
+        FieldError: no entry, more than three, one named twice, or one that there is not; with those that there are.
     """
     dims = tuple(_find_entry(spec, entry) for entry in entries)
     if not 1 <= len(dims) <= len(ENTRY_BINS) or len(set(dims)) < len(dims):
-        raise ValueError(f"coverage_dims={tuple(entries)!r}. Allowed: 1 to {len(ENTRY_BINS)} entries, each once.")
+        raise FieldError("coverage_dims", tuple(entries), f"1 to {len(ENTRY_BINS)} entries, each once")
     bins, count = ENTRY_BINS[len(dims) - 1], len(dims)
     grid = make_grid_coverage(range(count), (-1.0,) * count, (1.0,) * count, bins, "cells", clip=True)
     squash = _make_squash(spec)
@@ -171,10 +172,8 @@ def _find_entry(spec: EnvSpec, entry: str | int) -> int:
     """The index of an entry of the observation."""
     if isinstance(entry, int) or entry.lstrip("-").isdecimal():
         if not 0 <= int(entry) < spec.obs_size:
-            raise ValueError(
-                f"coverage_dims={entry!r} is out of range. Allowed: 0 to {spec.obs_size - 1}, or names: "
-                f"{', '.join(spec.obs_names)}."
-            )
+            allowed = f"0 to {spec.obs_size - 1}, or names: {', '.join(spec.obs_names)}"
+            raise FieldError("coverage_dims", entry, allowed, "is out of range")
         return int(entry)
     if entry in spec.obs_names:
         return spec.obs_names.index(entry)

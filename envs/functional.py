@@ -38,6 +38,13 @@ class Rules(NamedTuple):
     """`start_in(key, cell) -> physics`: as `start`, in a coverage cell; see `Environment.reset_in`."""
 
 
+class Parts(NamedTuple):
+    """The fixed parts of an environment in pure JAX."""
+
+    rules: Rules
+    obs_noise: float
+
+
 def make_environment(rules: Rules, obs_noise: float = 0.0, backend: str = BACKEND) -> Environment:
     """The environment that `rules` describe.
 
@@ -51,7 +58,8 @@ def make_environment(rules: Rules, obs_noise: float = 0.0, backend: str = BACKEN
         backend: what to call the engine.
 
     Raises:
-        ValueError: `obs_noise` is negative or not finite; from `step`, when traced: the action is not of shape `[A]`.
+        FieldError: `obs_noise` is negative or not finite.
+        ValueError: from `step`, when traced: the action is not of shape `[A]`.
 
     Example:
         A walk on a line, seen when it is right of 1:
@@ -67,54 +75,58 @@ def make_environment(rules: Rules, obs_noise: float = 0.0, backend: str = BACKEN
         >>> float(transition.next_obs[0] - transition.obs[0])
         0.09999...
     """
-    obs_noise, spec = check_noise(obs_noise), rules.spec
-    action_shape = (spec.action_size,)
-
-    def observe(key: Key, before: Any, after: Any) -> tuple[Key, Array]:
-        obs = jnp.asarray(rules.observe(before, after), jnp.float32)
-        if obs_noise == 0:
-            return key, obs
-        key, noise_key = jax.random.split(key)
-        return key, obs + obs_noise * jax.random.normal(noise_key, obs.shape, obs.dtype)
-
-    def reset_to(start: Callable[..., Any], key: Key, *cell: int) -> EnvState:
-        start_key, key = jax.random.split(key)
-        physics = start(start_key, *cell)
-        key, obs = observe(key, physics, physics)
-        return EnvState(physics, obs, jnp.int32(0), key)
-
-    def step(state: EnvState, action: Array) -> tuple[EnvState, Transition]:
-        if jnp.shape(action) != action_shape:
-            raise ValueError(f"action has shape {jnp.shape(action)}. Allowed: {action_shape}.")
-        action = jnp.asarray(action, jnp.float32)
-        choice = jax.nn.one_hot(jnp.argmax(action), spec.action_size)
-        action = choice if spec.discrete else jnp.clip(action, -1.0, 1.0)
-        num_steps = state.num_steps + 1
-        # Folded in, not split off: the noise is then the same whether or not the rules have use for this key. From 2
-        # on, because splitting in two is the same as folding 0 and 1 in.
-        after = rules.advance(jax.random.fold_in(state.key, num_steps + 1), state.physics, action)
-        key, obs = observe(state.key, state.physics, after)
-        transition = Transition(
-            obs=state.obs,
-            action=action,
-            reward=jnp.asarray(rules.reward(state.physics, action, after), jnp.float32),
-            next_obs=obs,
-            terminated=jnp.asarray(rules.terminated(after)) | ~all_finite((after, obs)),
-            truncated=num_steps >= spec.episode_steps,
-        )
-        return EnvState(after, obs, num_steps, key), transition
-
+    parts = Parts(rules, check_noise(obs_noise))
     return Environment(
-        spec,
-        functools.partial(reset_to, rules.start),
-        step,
+        rules.spec,
+        functools.partial(reset_to, parts, rules.start),
+        functools.partial(step, parts),
         rules.coverage,
         backend,
         True,
         rules.floor_plan,
         rules.view,
-        reset_in=rules.start_in and functools.partial(reset_to, rules.start_in),
+        reset_in=rules.start_in and functools.partial(reset_to, parts, rules.start_in),
     )
+
+
+def reset_to(parts: Parts, start: Callable[..., Any], key: Key, *cell: int) -> EnvState:
+    """A new episode that begins in `start(key, *cell)`."""
+    start_key, key = jax.random.split(key)
+    physics = start(start_key, *cell)
+    key, obs = _observe(parts, key, physics, physics)
+    return EnvState(physics, obs, jnp.int32(0), key)
+
+
+def step(parts: Parts, state: EnvState, action: Array) -> tuple[EnvState, Transition]:
+    """A step; see `Environment.step`."""
+    rules, spec, action_shape = parts.rules, parts.rules.spec, (parts.rules.spec.action_size,)
+    if jnp.shape(action) != action_shape:
+        raise ValueError(f"action has shape {jnp.shape(action)}. Allowed: {action_shape}.")
+    action = jnp.asarray(action, jnp.float32)
+    choice = jax.nn.one_hot(jnp.argmax(action), spec.action_size)
+    action = choice if spec.discrete else jnp.clip(action, -1.0, 1.0)
+    num_steps = state.num_steps + 1
+    # Folded in, not split off: the noise is then the same whether or not the rules have use for this key. From 2 on,
+    # because splitting in two is the same as folding 0 and 1 in.
+    after = rules.advance(jax.random.fold_in(state.key, num_steps + 1), state.physics, action)
+    key, obs = _observe(parts, state.key, state.physics, after)
+    transition = Transition(
+        obs=state.obs,
+        action=action,
+        reward=jnp.asarray(rules.reward(state.physics, action, after), jnp.float32),
+        next_obs=obs,
+        terminated=jnp.asarray(rules.terminated(after)) | ~all_finite((after, obs)),
+        truncated=num_steps >= spec.episode_steps,
+    )
+    return EnvState(after, obs, num_steps, key), transition
+
+
+def _observe(parts: Parts, key: Key, before: Any, after: Any) -> tuple[Key, Array]:
+    obs = jnp.asarray(parts.rules.observe(before, after), jnp.float32)
+    if parts.obs_noise == 0:
+        return key, obs
+    key, noise_key = jax.random.split(key)
+    return key, obs + parts.obs_noise * jax.random.normal(noise_key, obs.shape, obs.dtype)
 
 
 def all_finite(tree: Any) -> Array:

@@ -137,7 +137,7 @@ def make_half_cheetah(backend: str = "auto", obs_noise: float = 0.0) -> Environm
             use 0.02. The simulation does not see it.
 
     Raises:
-        ValueError: an unknown `backend`, or an `obs_noise` that is negative or not finite.
+        FieldError: an unknown `backend`, or an `obs_noise` that is negative or not finite.
     """
     return _make(SPEC, observe, lambda xp, action, qpos_before, qpos, qvel: 0.0, backend, obs_noise)
 

@@ -235,7 +235,7 @@ def make_hand_block(backend: str = "auto", obs_noise: float = 0.0) -> Environmen
 
     Raises:
         ImportError: gymnasium-robotics is not installed; says how to install it.
-        ValueError: an unknown `backend`, or an `obs_noise` that is negative or not finite.
+        FieldError: an unknown `backend`, or an `obs_noise` that is negative or not finite.
     """
     engine = choose_engine("mujoco" if backend == "auto" else backend)
     model = make_model()

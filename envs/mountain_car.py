@@ -113,7 +113,7 @@ def make_mountain_car(backend: str = "auto", obs_noise: float = 0.0) -> Environm
             does not see it.
 
     Raises:
-        ValueError: an unknown `backend`, or an `obs_noise` that is negative or not finite.
+        FieldError: an unknown `backend`, or an `obs_noise` that is negative or not finite.
     """
     validate.one_of("backend", backend, ("auto", BACKEND))
     limits = (MIN_POSITION, -MAX_SPEED), (MAX_POSITION, MAX_SPEED)

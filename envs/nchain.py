@@ -18,6 +18,7 @@ from envs.functional import BACKEND, Rules, make_environment
 from envs.views import make_sketch_view
 from jaxplore import validate
 from jaxplore.types import Array, Key
+from jaxplore.validate import FieldError
 
 START = 1
 EXTRA_STEPS = 9
@@ -52,7 +53,7 @@ def make_nchain(backend: str = "auto", obs_noise: float = 0.0, num_states: int =
         seed: of the flip-states, drawn once: they are the same in every episode.
 
     Raises:
-        ValueError: another `backend`, `obs_noise` other than 0, `num_states` below 3, or a negative `seed`.
+        FieldError: another `backend`, `obs_noise` other than 0, `num_states` below 3, or a negative `seed`.
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -63,7 +64,7 @@ def make_nchain(backend: str = "auto", obs_noise: float = 0.0, num_states: int =
     """
     validate.one_of("backend", backend, ("auto", BACKEND))
     if obs_noise != 0:
-        raise ValueError(f"obs_noise={obs_noise!r} does not fit one-hot observations. Allowed: 0.")
+        raise FieldError("obs_noise", obs_noise, "0", "does not fit one-hot observations")
     validate.at_least("num_states", num_states, 3)
     validate.at_least("seed", seed, 0)
     flips = flip_states(num_states, seed)

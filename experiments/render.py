@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.errors import RunError, disk_error
+from experiments.runs.errors import RunError, disk_error
+from experiments.runs.files import replacing
 
 if TYPE_CHECKING:
     from envs.base import Environment, EnvState
-    from envs.wrappers import Act
-    from experiments.config import RunConfig
+    from envs.stepper import Act
+    from experiments.runs.config import RunConfig
 
 RENDERERS = ("egl", "osmesa", "cgl", "glfw")
 """MuJoCo's, tried in this order unless `MUJOCO_GL` names one: a GPU, no GPU, a Mac, a screen."""
@@ -74,14 +75,18 @@ def load_actor(run: Path) -> tuple[RunConfig, Environment, Act, int]:
     """
     import jax
 
-    from experiments import loop
+    from experiments.runs.directory import RunDirectory, Status
+    from experiments.training import build, loop
 
-    config = loop.read_config(run)
-    own_env = loop.make_environment(config)
-    env = loop.on_host(config, own_env)
+    directory = RunDirectory(run)
+    if directory.status() is Status.ABSENT:
+        raise RunError(f"{run} holds no run (no config.json). Give the --out of a run.")
+    config = directory.config()
+    own_env = build.make_env(config)
+    env = build.on_host(config, own_env)
     _check_view(env, config.env)
-    explorer = loop.make_run_explorer(config, own_env)
-    state, step = loop.last_state(run, config, own_env, explorer)
+    explorer = build.make_agent(config, own_env)
+    state, step = loop.last_state(directory, own_env, explorer)
     actor = explorer.actor(jax.tree.map(lambda leaf: leaf[0], state.explorer))
     act = jax.jit(lambda key, obs: explorer.act(key, actor, obs))
     return config, env, act, step
@@ -96,14 +101,14 @@ def load_random(name: str) -> tuple[RunConfig, Environment, Act]:
     """
     import jax
 
-    from experiments import loop
-    from experiments.config import preset_config
+    from experiments.runs.presets import preset_config
+    from experiments.training import build
 
     config = dataclasses.replace(preset_config("laptop", name), method="random")
-    env = loop.make_environment(config)
-    env = loop.on_host(config, env)
+    env = build.make_env(config)
+    env = build.on_host(config, env)
     _check_view(env, name)
-    return config, env, jax.jit(loop.make_run_explorer(config, env).act_uniformly)
+    return config, env, jax.jit(build.make_agent(config, env).act_uniformly)
 
 
 def _check_view(env: Environment, name: str) -> None:
@@ -115,15 +120,13 @@ def episode(env: Environment, act: Act, seed: int, num_steps: int) -> list[EnvSt
     """The states of `num_steps` of acting, `num_steps + 1` of them, episode after episode."""
     import jax
 
-    from envs.wrappers import make_collect
+    from envs.stepper import make_walk
 
-    collect = make_collect(env, 1)
-    if env.compiled:
-        collect = jax.jit(collect, static_argnums=(2, 3))
+    walk = make_walk(env, 1)
     key = jax.random.key(seed)
     states = [env.reset(jax.random.fold_in(key, 0))]
     for step in range(num_steps):
-        states.append(collect(jax.random.fold_in(key, step + 1), states[-1], act, 1)[0])
+        states.append(walk(jax.random.fold_in(key, step + 1), states[-1], act, 1)[0])
     return states
 
 
@@ -155,13 +158,13 @@ def draw(
     camera = camera or env.view.cameras[0]
     validate.one_of("--camera", camera, env.view.cameras)
     validate.one_of("the ending of --out", path.suffix, SUFFIXES)
-    draft = path.with_suffix(f".tmp{path.suffix}")
     try:
-        if path.suffix == ".png":
-            chosen = [states[i] for i in np.linspace(0, len(states) - 1, min(STILLS, len(states))).round().astype(int)]
-            stills = list(env.view.frames(chosen, height, width, camera))
-            imageio.imwrite(draft, np.concatenate(stills, axis=1))
-        else:
+        with replacing(path) as draft:
+            if path.suffix == ".png":
+                places = np.linspace(0, len(states) - 1, min(STILLS, len(states))).round().astype(int)
+                stills = list(env.view.frames([states[i] for i in places], height, width, camera))
+                imageio.imwrite(draft, np.concatenate(stills, axis=1))
+                return
             options: dict[str, Any] = (
                 {"fps": round(1 / env.spec.dt), "macro_block_size": 2} if path.suffix == ".mp4" else {}
             )
@@ -172,11 +175,8 @@ def draw(
             ):
                 for frame in env.view.frames(states, height, width, camera):
                     writer.append_data(frame)
-        draft.replace(path)
     except OSError as error:
         raise disk_error("write the picture", path, error) from error
-    finally:
-        draft.unlink(missing_ok=True)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -205,8 +205,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     if (arguments.run is None) == (arguments.env is None):
         parser.error("give the directory of a run, or --env to see an environment under uniform actions.")
     try:
-        if arguments.run is not None and not (arguments.run / "config.json").is_file():
-            raise RunError(f"{arguments.run} holds no run (no config.json). Give the --out of a run.")
         # MuJoCo is about to be imported, and takes its renderer then; whether one is needed is known only later.
         failed = None
         try:
@@ -215,9 +213,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             os.environ.pop("MUJOCO_GL", None)
             failed = error
 
-        from experiments.run import use_compilation_cache
+        from experiments import runtime
 
-        use_compilation_cache()
+        runtime.use_compilation_cache()
         run: Path | None = arguments.run
         if run is None:
             (config, env, act), after = load_random(arguments.env), ""

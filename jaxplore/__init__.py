@@ -4,62 +4,106 @@ The pieces work alone: `make_generator` (networks from noise), `make_amortized_s
 network), `rewards`, `rollout` (imagination), `make_sac`, and `make_explorer`, which puts them together.
 """
 
-from jaxplore import rewards
-from jaxplore.behaviours import ImaginationConfig, ModelFreeConfig
-from jaxplore.beliefs import Belief, FitConfig, make_generator_belief
-from jaxplore.ddpg import DDPGConfig, make_ddpg
-from jaxplore.ddqn import DDQNConfig, make_ddqn
-from jaxplore.dynamics import DynamicsConfig, Prediction
-from jaxplore.ensemble import EnsembleConfig, make_ensemble_belief
-from jaxplore.exploration import Explorer, ExplorerState, make_explorer
-from jaxplore.generator import Generator, GeneratorConfig, make_generator
-from jaxplore.gradient_policy import GradientPolicyConfig, make_gradient_policy
-from jaxplore.imagination import rollout
-from jaxplore.learner import Learner
-from jaxplore.mcts import MCTSConfig, make_mcts
-from jaxplore.methods import METHODS, ExplorationConfig, Method, Sizes, get_method
-from jaxplore.planning import make_tree_search
-from jaxplore.ppo import PPO, PPOConfig, make_ppo
-from jaxplore.rnd import RNDConfig, make_rnd
-from jaxplore.sac import SACConfig, make_sac
-from jaxplore.svgd import (
+from jaxplore import dynamics, normalizer, replay
+from jaxplore.behaviours import (
+    Behaviour,
+    Experience,
+    GradientPolicyConfig,
+    ImaginationConfig,
+    MCTSConfig,
+    ModelFreeConfig,
+    ReactiveConfig,
+    World,
+    make_gradient_policy,
+    make_imagination,
+    make_mcts,
+    make_model_free,
+    make_reactive,
+    make_rnd_learner,
+    make_rnd_ppo,
+    make_tree_search,
+    make_uniform,
+    rollout,
+)
+from jaxplore.beliefs import (
     AmortizedSVGD,
+    Belief,
+    EnsembleConfig,
+    FitConfig,
+    Generator,
+    GeneratorConfig,
+    Judgement,
     SVGDConfig,
     make_amortized_svgd,
+    make_ensemble_belief,
+    make_generator,
+    make_generator_belief,
+    make_no_belief,
     stein_direction,
 )
+from jaxplore.config import ExplorationConfig, Sizes
+from jaxplore.dynamics import DynamicsConfig, Normalizers, Prediction
+from jaxplore.exploration import Actor, Explorer, ExplorerState, make_explorer
+from jaxplore.learners import (
+    PPO,
+    DDPGConfig,
+    DDQNConfig,
+    Learner,
+    PPOConfig,
+    SACConfig,
+    make_ddpg,
+    make_ddqn,
+    make_ppo,
+    make_sac,
+)
+from jaxplore.methods import METHODS, Method, get_method
+from jaxplore.replay import Replay
+from jaxplore.signals import RND, Reward, RNDConfig, make_rnd, rewards
 from jaxplore.types import Transition
+from jaxplore.validate import FieldError
 
 __version__ = "0.1.0"
 
 __all__ = [
     "METHODS",
     "PPO",
+    "RND",
+    "Actor",
     "AmortizedSVGD",
+    "Behaviour",
     "Belief",
     "DDPGConfig",
     "DDQNConfig",
     "DynamicsConfig",
     "EnsembleConfig",
+    "Experience",
     "ExplorationConfig",
     "Explorer",
     "ExplorerState",
+    "FieldError",
     "FitConfig",
     "Generator",
     "GeneratorConfig",
     "GradientPolicyConfig",
     "ImaginationConfig",
+    "Judgement",
     "Learner",
     "MCTSConfig",
     "Method",
     "ModelFreeConfig",
+    "Normalizers",
     "PPOConfig",
     "Prediction",
     "RNDConfig",
+    "ReactiveConfig",
+    "Replay",
+    "Reward",
     "SACConfig",
     "SVGDConfig",
     "Sizes",
     "Transition",
+    "World",
+    "dynamics",
     "get_method",
     "make_amortized_svgd",
     "make_ddpg",
@@ -69,11 +113,20 @@ __all__ = [
     "make_generator",
     "make_generator_belief",
     "make_gradient_policy",
+    "make_imagination",
     "make_mcts",
+    "make_model_free",
+    "make_no_belief",
     "make_ppo",
+    "make_reactive",
     "make_rnd",
+    "make_rnd_learner",
+    "make_rnd_ppo",
     "make_sac",
     "make_tree_search",
+    "make_uniform",
+    "normalizer",
+    "replay",
     "rewards",
     "rollout",
     "stein_direction",

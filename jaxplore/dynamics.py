@@ -124,6 +124,8 @@ class Encoding(NamedTuple):
     """`outputs(last layer [..., O]) -> [..., O]`: what it says. Losses, variances and kernels see this."""
     next_obs: Callable[[Normalizers, Array, Array], Array]
     """`next_obs(normalizers, obs [..., O], outputs [..., O]) -> [..., O]`: where that leads, as an observation."""
+    is_probability: bool = False
+    """Whether outputs are probabilities of next states, in place of changes of the observation."""
 
 
 @jax.custom_vjp
@@ -152,6 +154,7 @@ ONE_HOT = Encoding(
     targets=lambda normalizers, obs, next_obs: next_obs,
     outputs=probabilities,
     next_obs=_most_likely,
+    is_probability=True,
 )
 """Nothing normalised; the network predicts the probability of each next state, and the most likely one comes."""
 

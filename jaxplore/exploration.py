@@ -5,6 +5,7 @@ behaviour in what they imagine. Nothing here knows which method it runs.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -12,12 +13,19 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxplore import dynamics, replay, rewards
-from jaxplore.behaviours import Experience, uniform_actions
+from jaxplore import beliefs, dynamics, replay
+from jaxplore.behaviours.base import Behaviour, Experience
+from jaxplore.behaviours.uniform import uniform_actions
+from jaxplore.beliefs.base import Belief
+from jaxplore.config import ExplorationConfig, Sizes
 from jaxplore.dynamics import Normalizers
-from jaxplore.methods import ExplorationConfig, Method, Sizes, check_fits, divergence_reward
+from jaxplore.methods import Method, check_fits
+from jaxplore.parts import divergence_reward
 from jaxplore.replay import Replay
-from jaxplore.types import Array, Key, Metrics, Transition, no_metrics
+from jaxplore.signals import rewards
+from jaxplore.signals.base import Reward, Score
+from jaxplore.types import Array, Key, Metrics, Transition
+from jaxplore.validate import FieldError
 
 
 @struct.dataclass
@@ -31,17 +39,31 @@ class ExplorerState:
     normalizers: Normalizers
 
 
+@struct.dataclass
+class Actor:
+    """What acting needs."""
+
+    behaviour: Any
+    normalizers: Normalizers
+    uniform: Array
+    """Whether actions are uniform, in place of the behaviour's; bool."""
+
+
 class Explorer(NamedTuple):
     """An exploring agent as pure functions; jit, vmap over seeds and scan them as you like."""
 
     init: Callable[[Key], ExplorerState]
     """`init(key) -> state`."""
-    actor: Callable[[ExplorerState], Any]
-    """`actor(state) -> actor`: the part of the state that acting needs, small enough to hand around."""
-    act: Callable[[Key, Any, Array], Array]
-    """`act(key, actor, obs [..., O]) -> action [..., A]` of the behaviour."""
+    actor: Callable[..., Actor]
+    """`actor(state, uniform=False) -> actor`: what acting needs, small enough to hand around, and how it acts: as the
+    behaviour does, or with `uniform` (which may be traced) by uniform actions, as in the warm-up."""
+    act: Callable[[Key, Actor, Array], Array]
+    """`act(key, actor, obs [..., O]) -> action [..., A]`, as the actor says."""
+    act_greedily: Callable[[Key, Actor, Array], Array]
+    """`act_greedily(key, actor, obs [..., O]) -> action [..., A]`: what the behaviour holds for the best, for
+    evaluation. Only a behaviour that searches at random needs the key."""
     act_uniformly: Callable[[Key, Array], Array]
-    """`act_uniformly(key, obs [..., O]) -> action [..., A]`, for the warm-up."""
+    """`act_uniformly(key, obs [..., O]) -> action [..., A]`."""
     observe: Callable[[ExplorerState, Transition, Array], ExplorerState]
     """`observe(state, transitions [T, ...], valid [T]) -> state`: take real transitions in, learn nothing yet."""
     improve: Callable[[Key, ExplorerState, Array, Array], tuple[ExplorerState, Metrics]]
@@ -49,12 +71,14 @@ class Explorer(NamedTuple):
     behaviour. `obs` is where the environment stands. `num_data` (int32) is how many transitions have come; it sets
     how long the fit is and must be the same for all seeds under `vmap`, or each takes as long as the longest."""
     assess: Callable[[Key, ExplorerState, Transition, Array], Metrics]
-    """`assess(key, state, transitions [T, ...], valid [T]) -> metrics`: what the belief makes of transitions it has
-    not seen. `intrinsic_reward` in the reward's own units; so that methods can be compared, of every belief also the
-    `variance` of its models (equation 1, in units of normalised delta or probability) and their `divergence`
-    (Jensen-Renyi, of probabilities Jensen-Shannon, in nats); of each the mean, and with `_p95` the 95th percentile. And
-    `model_error`, the mean squared error of the models' mean, per normalised-delta entry, where 1 is as good as
-    predicting the mean change; or per probability."""
+    """`assess(key, state, transitions [T, ...], valid [T]) -> metrics`: what transitions that have not been learned
+    from are worth. `intrinsic_reward` in the unit `reward_unit`, of every method that has one. Of every belief, so that
+    methods can be compared, also the `variance` of its models (equation 1, in units of normalised delta or
+    probability) and their `divergence` (Jensen-Renyi, of probabilities Jensen-Shannon, in nats); of each the mean, and
+    with `_p95` the 95th percentile. And `model_error`, the mean squared error of the models' mean, per normalised-delta
+    entry, where 1 is as good as predicting the mean change; or per probability."""
+    reward_unit: str | None
+    """Of the intrinsic reward, for labels. None: the method has no intrinsic reward."""
 
 
 def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Explorer:
@@ -81,87 +105,128 @@ def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Ex
         (1,)
     """
     if config.dynamics.target == "one_hot" and not sizes.one_hot_obs:
-        raise ValueError(
-            "DynamicsConfig.target='one_hot' predicts which of finitely many states comes next, and this environment's "
-            "observations are not one-hot. Allowed: 'delta'."
+        raise FieldError(
+            "target",
+            "one_hot",
+            "'delta'",
+            "predicts which of finitely many states comes next, and this environment's observations are not one-hot",
+            "DynamicsConfig",
         )
     check_fits(method, sizes)
-    belief = method.belief(sizes, config)
-    reward = method.reward(config)
-    behaviour = method.behaviour(sizes, config, belief, reward)
-    divergence = divergence_reward(config)
+    belief, reward = method.belief(sizes, config), method.reward(config)
+    behaviour = method.behaviour(sizes, config, belief, reward.score)
+    agent = Agent(belief, reward, divergence_reward(config).score, behaviour, sizes, config.data_capacity)
+    return Explorer(
+        init=functools.partial(init, agent),
+        actor=functools.partial(actor, agent),
+        act=functools.partial(act, agent),
+        act_greedily=functools.partial(act_greedily, agent),
+        act_uniformly=functools.partial(act_uniformly, agent),
+        observe=observe,
+        improve=functools.partial(improve, agent),
+        assess=functools.partial(assess, agent),
+        reward_unit=reward.unit if belief.predict else behaviour.bonus.unit if behaviour.bonus else None,
+    )
+
+
+class Agent(NamedTuple):
+    """The fixed parts of an explorer."""
+
+    belief: Belief
+    reward: Reward
+    divergence: Score
+    """Logged of every belief."""
+    behaviour: Behaviour
+    sizes: Sizes
+    data_capacity: int
+
+
+def init(agent: Agent, key: Key) -> ExplorerState:
+    """An agent that has seen nothing."""
+    sizes = agent.sizes
     flag = jnp.zeros((), bool)
     example = Transition(jnp.zeros(sizes.obs), jnp.zeros(sizes.action), jnp.zeros(()), jnp.zeros(sizes.obs), flag, flag)
+    belief_key, behaviour_key = jax.random.split(key)
+    return ExplorerState(
+        belief=agent.belief.init(belief_key),
+        behaviour=agent.behaviour.init(behaviour_key),
+        data=replay.init(example, agent.data_capacity),
+        normalizers=dynamics.init_normalizers(sizes.obs, sizes.action),
+    )
 
-    def init(key: Key) -> ExplorerState:
-        belief_key, behaviour_key = jax.random.split(key)
-        return ExplorerState(
-            belief=belief.init(belief_key),
-            behaviour=behaviour.init(behaviour_key),
-            data=replay.init(example, config.data_capacity),
-            normalizers=dynamics.init_normalizers(sizes.obs, sizes.action),
-        )
 
-    def actor(state: ExplorerState) -> Any:
-        return behaviour.actor(state.behaviour), state.normalizers
+def actor(agent: Agent, state: ExplorerState, uniform: bool | Array = False) -> Actor:
+    """What acting needs of a state."""
+    return Actor(agent.behaviour.actor(state.behaviour), state.normalizers, jnp.asarray(uniform))
 
-    def act(key: Key, actor: Any, obs: Array) -> Array:
-        behaviour_actor, normalizers = actor
-        return behaviour.act(key, behaviour_actor, normalizers, obs)
 
-    def act_uniformly(key: Key, obs: Array) -> Array:
-        return uniform_actions(key, obs, sizes.action, sizes.discrete)
+def act(agent: Agent, key: Key, actor: Actor, obs: Array) -> Array:
+    """An action `[..., A]` for `obs [..., O]`, as the actor says."""
+    drawn = agent.behaviour.act(key, actor.behaviour, actor.normalizers, obs)
+    return jnp.where(actor.uniform, act_uniformly(agent, key, obs), drawn)
 
-    def observe(state: ExplorerState, transitions: Transition, valid: Array) -> ExplorerState:
-        return dataclasses.replace(
-            state,
-            data=replay.add(state.data, transitions, valid),
-            normalizers=dynamics.update_normalizers(state.normalizers, transitions, valid),
-        )
 
-    def fit(key: Key, state: ExplorerState, num_data: Array) -> tuple[Any, Metrics]:
-        init_key, steps_key = jax.random.split(key)
-        start = belief.init(init_key) if config.fit.restart else state.belief
+def act_greedily(agent: Agent, key: Key, actor: Actor, obs: Array) -> Array:
+    """The action `[..., A]` that the behaviour holds for the best."""
+    best = agent.behaviour.act_greedily or agent.behaviour.act
+    return best(key, actor.behaviour, actor.normalizers, obs)
 
-        def step(i: Array, carry: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
-            return belief.update(jax.random.fold_in(steps_key, i), carry[0], state.data, state.normalizers)
 
-        metrics = no_metrics(lambda: belief.update(steps_key, start, state.data, state.normalizers)[1])
-        return jax.lax.fori_loop(0, config.fit.num_steps(num_data), step, (start, metrics))
+def act_uniformly(agent: Agent, key: Key, obs: Array) -> Array:
+    """A uniform action `[..., A]`."""
+    return uniform_actions(key, obs, agent.sizes.action, agent.sizes.discrete)
 
-    def improve(key: Key, state: ExplorerState, obs: Array, num_data: Array) -> tuple[ExplorerState, Metrics]:
-        fit_key, models_key, improve_key = jax.random.split(key, 3)
-        fitted, fit_metrics = fit(fit_key, state, num_data)
-        models = belief.sample(models_key, fitted, config.imagination.num_models)
-        experience = Experience(models, state.data, num_data, state.normalizers, obs)
-        improved, metrics = behaviour.improve(improve_key, state.behaviour, experience)
-        return dataclasses.replace(state, belief=fitted, behaviour=improved), {
-            **{f"fit/{name}": value for name, value in fit_metrics.items()},
-            **{f"policy/{name}": value for name, value in metrics.items()},
-        }
 
-    def assess(key: Key, state: ExplorerState, transitions: Transition, valid: Array) -> Metrics:
-        if belief.predict is None:
-            return {}
-        models = belief.sample(key, state.belief, config.imagination.num_models)
-        # Valid rows take the others' places: a reward may compare rows.
-        count = jnp.sum(valid)
-        order = jnp.argsort(~valid)[jnp.arange(valid.shape[0]) % jnp.maximum(count, 1)]
-        rows = jax.tree.map(lambda leaf: leaf[order], transitions)
-        counts = jnp.arange(valid.shape[0]) < count
-        inputs = belief.encoding.inputs(state.normalizers, rows.obs, rows.action)
-        delta = belief.encoding.targets(state.normalizers, rows.obs, rows.next_obs)
-        prediction = belief.predict(models, inputs)
-        of_each = {
-            "intrinsic_reward": reward(prediction, delta, state.normalizers),
-            "variance": rewards.variance(prediction),
-            "divergence": divergence(prediction, delta, state.normalizers),
-        }
-        metrics = {}
-        for name, values in of_each.items():
-            held = jnp.where(counts, values, jnp.nan)
-            metrics |= {name: jnp.nanmean(held), f"{name}_p95": jnp.nanpercentile(held, 95.0)}
-        errors = jnp.mean((jnp.mean(prediction.mean, axis=0) - delta) ** 2, axis=-1)
-        return {**metrics, "model_error": jnp.nanmean(jnp.where(counts, errors, jnp.nan))}
+def observe(state: ExplorerState, transitions: Transition, valid: Array) -> ExplorerState:
+    """Take real transitions `[T, ...]` in where `valid [T]` is set; nothing is learned yet."""
+    return dataclasses.replace(
+        state,
+        data=replay.add(state.data, transitions, valid),
+        normalizers=dynamics.update_normalizers(state.normalizers, transitions, valid),
+    )
 
-    return Explorer(init, actor, act, act_uniformly, observe, improve, assess)
+
+def improve(agent: Agent, key: Key, state: ExplorerState, obs: Array, num_data: Array) -> tuple[ExplorerState, Metrics]:
+    """Fit the belief, draw models from it, improve the behaviour (Algorithm 1, lines 5 to 9)."""
+    belief, behaviour = agent.belief, agent.behaviour
+    fit_key, models_key, improve_key = jax.random.split(key, 3)
+    fitted, fit_metrics = beliefs.fit(belief, fit_key, state.belief, state.data, state.normalizers, num_data)
+    models = belief.sample(models_key, fitted, belief.num_models)
+    experience = Experience(models, state.data, num_data, state.normalizers, obs)
+    improved, metrics = behaviour.improve(improve_key, state.behaviour, experience)
+    return dataclasses.replace(state, belief=fitted, behaviour=improved), {
+        **{f"fit/{name}": value for name, value in fit_metrics.items()},
+        **{f"policy/{name}": value for name, value in metrics.items()},
+    }
+
+
+def assess(agent: Agent, key: Key, state: ExplorerState, transitions: Transition, valid: Array) -> Metrics:
+    """What transitions `[T, ...]` that have not been learned from are worth; see `Explorer.assess`."""
+    belief, bonus = agent.belief, agent.behaviour.bonus
+    if belief.predict is None and bonus is None:
+        return {}
+    # Valid rows take the others' places: a reward may compare rows.
+    count = jnp.sum(valid)
+    order = jnp.argsort(~valid)[jnp.arange(valid.shape[0]) % jnp.maximum(count, 1)]
+    rows = jax.tree.map(lambda leaf: leaf[order], transitions)
+    counts = jnp.arange(valid.shape[0]) < count
+    if belief.predict is None:
+        assert bonus is not None
+        given = bonus.score(state.behaviour, state.normalizers, rows)
+        return _spread("intrinsic_reward", jnp.where(counts, given, jnp.nan))
+    models = belief.sample(key, state.belief, belief.num_models)
+    prediction, delta = belief.judge(models, state.normalizers, rows)
+    of_each = {
+        "intrinsic_reward": agent.reward.score(prediction, delta, state.normalizers),
+        "variance": rewards.variance(prediction),
+        "divergence": agent.divergence(prediction, delta, state.normalizers),
+    }
+    metrics = {}
+    for name, values in of_each.items():
+        metrics |= _spread(name, jnp.where(counts, values, jnp.nan))
+    errors = jnp.mean((jnp.mean(prediction.mean, axis=0) - delta) ** 2, axis=-1)
+    return {**metrics, "model_error": jnp.nanmean(jnp.where(counts, errors, jnp.nan))}
+
+
+def _spread(name: str, values: Array) -> Metrics:
+    return {name: jnp.nanmean(values), f"{name}_p95": jnp.nanpercentile(values, 95.0)}

@@ -1,12 +1,53 @@
 """Checks that configurations and factories run on their input.
 
-Each raises a `ValueError` that names the field, its value and what is allowed; a misspelt name gets the nearest match.
+Each raises a `FieldError`, a `ValueError` that knows the field, its value and what is allowed; a misspelt name gets the
+nearest match.
 """
 
+import contextlib
 import difflib
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Any
+
+
+class FieldError(ValueError):
+    """A field holds what it may not.
+
+    Its text names the field as the code does (`SACConfig.lr`). Who knows the field by another name, such as a flag,
+    has `spell` for it.
+
+    Args:
+        field: name of the field, or its path from the outermost configuration, such as `explorer.sac.lr`.
+        value: what it holds.
+        allowed: what it may hold.
+        problem: what is wrong with the value, as the rest of a sentence: `"is out of range"`.
+        owner: name of the class that the field is of.
+
+    Example:
+        >>> error = FieldError("lr", -1.0, "a finite number in (0, inf)", "is out of range", "SACConfig")
+        >>> str(error)
+        'SACConfig.lr=-1.0 is out of range. Allowed: a finite number in (0, inf).'
+        >>> error.spell("--sac.lr")
+        '--sac.lr=-1.0 is out of range. Allowed: a finite number in (0, inf).'
+    """
+
+    def __init__(self, field: str, value: Any, allowed: str, problem: str = "", owner: str = "") -> None:
+        self.field, self.value, self.allowed, self.problem, self.owner = field, value, allowed, problem, owner
+        super().__init__(self.spell(f"{owner}.{field}" if owner else field))
+
+    def spell(self, name: str) -> str:
+        """The message, with the field called `name`."""
+        problem = f" {self.problem}." if self.problem and self.problem[-1] not in ".?" else f" {self.problem}".rstrip()
+        return f"{name}={self.value!r}{problem or '.'} Allowed: {self.allowed}."
+
+    def of(self, owner: str) -> "FieldError":
+        """The same error, of a field of `owner`."""
+        return FieldError(self.field, self.value, self.allowed, self.problem, owner)
+
+    def at(self, prefix: str) -> "FieldError":
+        """The same error, of a field with the path `prefix` before its name and no owner."""
+        return FieldError(f"{prefix}{self.field}", self.value, self.allowed, self.problem)
 
 
 def one_of(field: str, value: Any, allowed: Iterable[str]) -> None:
@@ -16,7 +57,7 @@ def one_of(field: str, value: Any, allowed: Iterable[str]) -> None:
         return
     close = difflib.get_close_matches(str(value), names, n=1)
     hint = f" Did you mean {close[0]!r}?" if close else ""
-    raise ValueError(f"{field}={value!r} is not known.{hint} Allowed: {', '.join(names)}.")
+    raise FieldError(field, value, ", ".join(names), f"is not known.{hint}")
 
 
 def in_range(
@@ -34,19 +75,19 @@ def in_range(
         return
     left = f"{'(' if open_low or low == -math.inf else '['}{low:g}"
     right = f"{high:g}{')' if open_high or high == math.inf else ']'}"
-    raise ValueError(f"{field}={value!r} is out of range. Allowed: a finite number in {left}, {right}.")
+    raise FieldError(field, value, f"a finite number in {left}, {right}", "is out of range")
 
 
 def at_least(field: str, value: int, low: int) -> None:
     """Raise unless `value` is a whole number of at least `low`."""
     if isinstance(value, bool) or not isinstance(value, int) or value < low:
-        raise ValueError(f"{field}={value!r} is out of range. Allowed: a whole number, {low} or more.")
+        raise FieldError(field, value, f"a whole number, {low} or more", "is out of range")
 
 
 def widths(field: str, value: tuple[int, ...]) -> None:
     """Raise unless `value` is a tuple of layer widths, each a whole number of at least 1."""
     if not isinstance(value, tuple) or not value:
-        raise ValueError(f"{field}={value!r} is not a list of layer widths. Allowed: one or more whole numbers.")
+        raise FieldError(field, value, "one or more whole numbers", "is not a list of layer widths")
     for width in value:
         at_least(field, width, 1)
 
@@ -64,21 +105,33 @@ class Checks:
     def __init__(self, config: Any) -> None:
         self._config = config
 
-    def _name(self, field: str) -> str:
-        return f"{type(self._config).__name__}.{field}"
+    @contextlib.contextmanager
+    def _owned(self) -> Iterator[None]:
+        try:
+            yield
+        except FieldError as error:
+            raise error.of(type(self._config).__name__) from None
 
     def one_of(self, field: str, allowed: Iterable[str]) -> None:
         """See `validate.one_of`."""
-        one_of(self._name(field), getattr(self._config, field), allowed)
+        with self._owned():
+            one_of(field, getattr(self._config, field), allowed)
 
     def in_range(self, field: str, low: float = -math.inf, high: float = math.inf, **ends: bool) -> None:
         """See `validate.in_range`."""
-        in_range(self._name(field), getattr(self._config, field), low, high, **ends)
+        with self._owned():
+            in_range(field, getattr(self._config, field), low, high, **ends)
 
     def at_least(self, field: str, low: int) -> None:
         """See `validate.at_least`."""
-        at_least(self._name(field), getattr(self._config, field), low)
+        with self._owned():
+            at_least(field, getattr(self._config, field), low)
 
     def widths(self, field: str) -> None:
         """See `validate.widths`."""
-        widths(self._name(field), getattr(self._config, field))
+        with self._owned():
+            widths(field, getattr(self._config, field))
+
+    def refusal(self, field: str, problem: str, allowed: str) -> FieldError:
+        """The error to raise for a field that does not go with the others."""
+        return FieldError(field, getattr(self._config, field), allowed, problem, type(self._config).__name__)

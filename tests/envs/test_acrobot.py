@@ -11,7 +11,7 @@ import pytest
 
 from envs import acrobot, coverage
 from envs.acrobot import SPEC, make_acrobot
-from envs.wrappers import make_collect
+from envs.stepper import make_collect
 
 RIGHT, LEFT, DOWN = np.pi / 2, -np.pi / 2, 0.0
 

@@ -5,7 +5,7 @@ import pytest
 
 import envs
 from envs import brax_adapter
-from envs.wrappers import make_collect
+from envs.stepper import make_collect
 
 # Without physics; one joint; two joints and a target; contacts, and an end when it falls.
 NAMES = (

@@ -6,7 +6,7 @@ from gymnasium import spaces
 
 import envs
 from envs.base import EnvState
-from envs.wrappers import make_collect, make_collect_all
+from envs.stepper import make_collect, make_collect_all
 
 # Of different shape: bounded torque, choices, MuJoCo, sparse reward, and one of ours with a bit of everything.
 IDS = ("Pendulum-v1", "CartPole-v1", "HalfCheetah-v5", "MountainCarContinuous-v0", "jaxplore_test/Toy-v0")

@@ -9,7 +9,7 @@ from gymnasium.utils.env_checker import check_env
 
 import envs
 from envs.functional import Rules, make_environment
-from envs.gymnasium_api import GymnasiumEnv, gymnasium_id
+from envs.adapters.to_gymnasium import GymnasiumEnv, gymnasium_id
 from envs.views import make_sketch_view
 
 NAMES = {

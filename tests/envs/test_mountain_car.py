@@ -8,7 +8,7 @@ import pytest
 
 from envs import coverage
 from envs.mountain_car import GOAL_POSITION, REACHABLE, SPEC, make_mountain_car
-from envs.wrappers import make_collect
+from envs.stepper import make_collect
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import pytest
 import envs
 from envs import coverage
 from envs.nchain import flip_states, make_nchain
-from envs.wrappers import make_collect
+from envs.stepper import make_collect
 from experiments import loop
 from experiments.config import RunConfig
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs.wrappers import make_collect
+from envs.stepper import make_collect
 
 BACKENDS = ["mujoco", "mjx"]
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxplore import replay
-from jaxplore.learner import Learner
+from jaxplore.learners.base import Learner
 from jaxplore.types import Array, Key, Transition
 
 EPISODE = 200

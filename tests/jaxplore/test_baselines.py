@@ -8,19 +8,20 @@ import numpy as np
 import pytest
 
 from jaxplore import dynamics, replay, rewards
-from jaxplore.behaviours import LABEL_CHUNK, Experience, ImaginationConfig, label, make_reactive
-from jaxplore.beliefs import Belief, make_no_belief
+from jaxplore.behaviours import Experience, ImaginationConfig, ReactiveConfig, make_reactive
+from jaxplore.behaviours.base import LABEL_CHUNK, label
+from jaxplore.beliefs import Belief, EnsembleConfig, make_no_belief
+from jaxplore.config import ExplorationConfig, Sizes
 from jaxplore.dynamics import DynamicsConfig, Prediction
 from jaxplore.exploration import make_explorer
-from jaxplore.learner import Learner
-from jaxplore.methods import METHODS, ExplorationConfig, Sizes
-from jaxplore.sac import SACConfig
+from jaxplore.learners.base import Learner
+from jaxplore.learners.sac import SACConfig
+from jaxplore.methods import METHODS
 from jaxplore.types import Transition
 
 O, A, M = 3, 2, 4  # noqa: E741
 SIZES, CHAIN = Sizes(O, A), Sizes(6, 2, discrete=True, one_hot_obs=True)
 TINY = ImaginationConfig(
-    num_models=M,
     num_actors=4,
     horizon=3,
     num_rollouts=3,
@@ -32,7 +33,9 @@ TINY = ImaginationConfig(
 SMALL = ExplorationConfig(
     data_capacity=64,
     dynamics=DynamicsConfig(hidden=(8,)),
+    ensemble=EnsembleConfig(num_members=M),
     imagination=TINY,
+    reactive=ReactiveConfig(updates=5),
     sac=SACConfig(hidden=(8, 8), batch_size=8),
 )
 
@@ -77,12 +80,12 @@ def variance(prediction, delta, normalizers):
     return rewards.variance(prediction)
 
 
-@pytest.mark.parametrize(("num_updates", "restart_every", "lives"), [(0, 1, [5, 5, 5]), (7, 2, [7, 14, 7])])
+@pytest.mark.parametrize(("num_updates", "restart_every", "lives"), [(5, 1, [5, 5, 5]), (7, 2, [7, 14, 7])])
 def test_a_reactive_policy_sees_real_transitions_alone(num_updates, restart_every, lives):
     # every row of a batch is one of the 20 real ones, normalised, with its reward by today's models in place of the
-    # environment's 7; 1 + 2 x 2 updates unless told, as where rollouts are imagined
-    config = dataclasses.replace(TINY, restart_every=restart_every)
-    behaviour = make_reactive(BELIEF, variance, recorder(16), O, A, config, num_updates)
+    # environment's 7; as many updates as the settings say, from a new policy each round or every second one
+    config = ReactiveConfig(updates=num_updates, restart_every=restart_every)
+    behaviour = make_reactive(BELIEF, variance, recorder(16), O, A, config)
     experience = real_data(20)
     state, improve = behaviour.init(jax.random.key(0)), jax.jit(behaviour.improve)
     for number, life in enumerate(lives):
@@ -119,22 +122,26 @@ def test_rewards_that_compare_rows_see_held_rows_only(num):
 def test_a_reactive_policy_needs_models():
     # nothing to label by
     with pytest.raises(ValueError, match="belief predicts nothing, so nothing can be labelled"):
-        make_reactive(make_no_belief(), variance, recorder(4), O, A, TINY)
+        make_reactive(make_no_belief(), variance, recorder(4), O, A)
 
 
 def test_settings_are_those_of_maxs_commands():
     # nnaisense/max's README: swish for all; MAX and JDRX alpha 0.02, TVAX and PERX 0.2; JDRX and PERX 100 reactive
-    # updates. On the chain its networks are the others' (tanh there). Methods of the paper's own share every setting
+    # updates. On the chain its networks are the others' (tanh there). Methods of the paper's own share every setting,
+    # and those on real data make as many updates as are made in imagination: 100 + (50 - 3) x 50
     default = ExplorationConfig()
     for name, alpha, updates in (
-        ("max", 0.02, 0),
+        ("max", 0.02, 2450),
         ("max_reactive", 0.02, 100),
-        ("max_trajectory", 0.2, 0),
+        ("max_trajectory", 0.2, 2450),
         ("prediction_error", 0.2, 100),
     ):
         config = METHODS[name].settings(default)
-        assert (config.dynamics.activation, config.sac.alpha, config.reactive_updates) == ("swish", alpha, updates)
+        assert (config.dynamics.activation, config.sac.alpha, config.reactive.updates) == ("swish", alpha, updates)
         assert config.renyi_decay == 0.1 and config.fit == default.fit and config.imagination == default.imagination
+    imagined = default.imagination
+    trained = imagined.num_rollouts - imagined.num_random_rollouts
+    assert imagined.real_updates + trained * imagined.updates_per_rollout == default.reactive.updates == 2450
     for name in ("implicit", "disagreement", "icm", "icm_active", "random"):
         assert METHODS[name].settings(default) == default
     chain = ExplorationConfig(dynamics=DynamicsConfig(activation="tanh", target="one_hot"))
@@ -153,7 +160,7 @@ def test_rewards_of_the_table():
     stats, prediction = experience.normalizers, prediction_of(means, 0.1 * jnp.ones((M, 5, O)))
 
     def given(name, prediction=prediction, **settings):
-        return METHODS[name].reward(ExplorationConfig(**settings))(prediction, delta, stats)
+        return METHODS[name].reward(ExplorationConfig(**settings)).score(prediction, delta, stats)
 
     np.testing.assert_array_equal(given("disagreement"), rewards.variance(prediction))
     for name in ("max", "max_reactive"):
@@ -194,7 +201,7 @@ def test_what_needs_actions_that_are_numbers_is_refused_on_the_chain(name):
 
 @pytest.mark.parametrize("name", ["max", "icm"])
 def test_a_round_of_a_baseline(name):
-    # one active, one reactive: models are fitted, the policy moves, and what is told of new transitions has every
+    # one active, one reactive: models are fitted, the policy moves, and what is reported of new transitions has every
     # method's measure beside its own
     method = METHODS[name]
     config = dataclasses.replace(SMALL, imagination=dataclasses.replace(TINY, real_updates=0))
@@ -208,6 +215,8 @@ def test_a_round_of_a_baseline(name):
     for part in ("belief", "behaviour"):
         pairs = zip(jax.tree.leaves(getattr(state, part)), jax.tree.leaves(getattr(after, part)), strict=True)
         assert any(np.any(np.asarray(a) != np.asarray(b)) for a, b in pairs)
-    told = jax.jit(explorer.assess)(key, after, jax.tree.map(lambda x: x[:9], experience.data.rows), jnp.arange(9) != 2)
-    assert {"variance", "divergence", "model_error", "intrinsic_reward_p95"} <= told.keys()
-    assert (float(told["divergence"]) == pytest.approx(float(told["intrinsic_reward"]))) == (name == "max")
+    reported = jax.jit(explorer.assess)(
+        key, after, jax.tree.map(lambda x: x[:9], experience.data.rows), jnp.arange(9) != 2
+    )
+    assert {"variance", "divergence", "model_error", "intrinsic_reward_p95"} <= reported.keys()
+    assert (float(reported["divergence"]) == pytest.approx(float(reported["intrinsic_reward"]))) == (name == "max")

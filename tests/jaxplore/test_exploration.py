@@ -8,14 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxplore import behaviours, rewards
+from jaxplore import rewards
+from jaxplore.behaviours import ImaginationConfig, make_imagination
 from jaxplore.beliefs import Belief, FitConfig
+from jaxplore.beliefs.generator import GeneratorConfig
+from jaxplore.beliefs.svgd import SVGDConfig
+from jaxplore.config import ExplorationConfig, Sizes
 from jaxplore.dynamics import DynamicsConfig, Prediction
 from jaxplore.exploration import make_explorer
-from jaxplore.generator import GeneratorConfig
-from jaxplore.methods import METHODS, ExplorationConfig, ImaginationConfig, Method, Sizes, get_method
-from jaxplore.sac import Learner, SACConfig
-from jaxplore.svgd import SVGDConfig
+from jaxplore.learners import Learner, SACConfig
+from jaxplore.methods import METHODS, Method, get_method
+from jaxplore.signals import Reward
 from jaxplore.types import Transition
 
 SIZES = Sizes(obs=3, action=2)
@@ -40,17 +43,24 @@ def counting_belief(sizes, config):
     def update(key, state, data, normalizers):
         return state + 1, {"updates": state + 1}
 
-    return Belief(init=lambda key: jnp.zeros((), jnp.int32), update=update, sample=sample, predict=predict)
+    return Belief(
+        init=lambda key: jnp.zeros((), jnp.int32),
+        update=update,
+        sample=sample,
+        predict=predict,
+        num_models=NUM_MODELS,
+        fit_config=config.fit,
+    )
 
 
 def variance_and_change(config):
     """Equation 1, plus 100 times the first entry of the change that happened."""
-    return lambda prediction, delta, normalizers: rewards.variance(prediction) + 100 * delta[:, 0]
+    return Reward(lambda prediction, delta, normalizers: rewards.variance(prediction) + 100 * delta[:, 0], "its own")
 
 
 def tagged(config):
     """A number that all models of one draw share."""
-    return lambda prediction, delta, normalizers: prediction.mean[0, :, 0]
+    return Reward(lambda prediction, delta, normalizers: prediction.mean[0, :, 0], "its own")
 
 
 def recording_learner(sizes, batch_size):
@@ -68,17 +78,16 @@ def recording_learner(sizes, batch_size):
     )
 
 
-def recording(sizes, config, belief, reward):
+def recording(sizes, config, belief, score):
     learner = recording_learner(sizes, config.sac.batch_size)
-    return behaviours.make_imagination(belief, reward, learner, sizes.obs, sizes.action, config.imagination)
+    return make_imagination(belief, score, learner, sizes.obs, sizes.action, config.imagination)
 
 
 def fake_explorer(
     reward=variance_and_change, fit=None, capacity=64, batch_size=16, belief=counting_belief, **imagination
 ):
-    """An explorer of the fakes above; 3 fit steps and one imagined rollout of 4 actors x 2 steps unless told."""
+    """An explorer of the fakes above; 3 fit steps and one imagined rollout of 4 actors x 2 steps by default."""
     settings = {
-        "num_models": NUM_MODELS,
         "num_actors": 4,
         "horizon": 2,
         "num_rollouts": 1,
@@ -371,7 +380,6 @@ SMALL = ExplorationConfig(
     svgd=SVGDConfig(num_particles=4),
     fit=FitConfig(lr=1e-2, batch_size=8, epochs=1, restart=False),
     imagination=ImaginationConfig(
-        num_models=4,
         num_actors=4,
         horizon=3,
         num_rollouts=3,

@@ -4,13 +4,15 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from jaxplore import behaviours, beliefs, dynamics, sac
-from jaxplore.ddpg import DDPGConfig
+from jaxplore import behaviours, beliefs, dynamics
+from jaxplore.behaviours.gradient import GradientPolicyConfig
+from jaxplore.config import ExplorationConfig, Sizes
 from jaxplore.exploration import make_explorer
-from jaxplore.gradient_policy import GradientPolicyConfig
-from jaxplore.methods import METHODS, ExplorationConfig, Sizes
-from jaxplore.ppo import PPOConfig
-from jaxplore.rnd import RNDConfig
+from jaxplore.learners import sac
+from jaxplore.learners.ddpg import DDPGConfig
+from jaxplore.learners.ppo import PPOConfig
+from jaxplore.methods import METHODS
+from jaxplore.signals.distillation import RNDConfig
 from jaxplore.types import Transition
 
 NUM_SEEDS, ROWS = 2, 5
@@ -19,7 +21,7 @@ CONFIG = ExplorationConfig(
     data_capacity=50,
     dynamics=dynamics.DynamicsConfig(hidden=(4,)),
     fit=beliefs.FitConfig(batch_size=4, epochs=0, steps=2),
-    imagination=behaviours.ImaginationConfig(num_models=2, num_actors=3, horizon=2, num_rollouts=2),
+    imagination=behaviours.ImaginationConfig(num_actors=3, horizon=2, num_rollouts=2),
     sac=sac.SACConfig(hidden=(4,), batch_size=4),
     task_sac=sac.SACConfig(hidden=(4,), batch_size=4),
     ddpg=DDPGConfig(hidden=(4,), batch_size=4),

@@ -1,0 +1,1 @@
+"""Environments of other packages as ours, and ours as Gymnasium's."""

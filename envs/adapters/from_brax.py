@@ -1,0 +1,86 @@
+"""Any Brax environment: `make("brax:hopper")`. Pure JAX; see `envs.adapters.brax_like` for what becomes of its parts.
+
+Observations, actions in [-1, 1] and rewards are Brax's own. Episodes are 1,000 steps, as Brax's own training has them.
+Coverage: see `envs.coverage.make_generic_coverage`.
+"""
+
+import contextlib
+import functools
+import warnings
+from collections.abc import Iterator
+from types import ModuleType
+from typing import Any
+
+from envs.adapters import brax_like
+from envs.base import Environment
+from jaxplore import validate
+
+BACKENDS = ("generalized", "mjx", "positional", "spring")
+"""Brax's engines."""
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Without the warnings that Brax makes of itself, which its user can do nothing about."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "JAXopt is no longer maintained", DeprecationWarning)
+        warnings.filterwarnings("ignore", "Brax System, piplines and environments", UserWarning)
+        warnings.filterwarnings("ignore", "Accessing `\\w+` directly from `Data` is deprecated", DeprecationWarning)
+        yield
+
+
+@functools.cache
+def load() -> ModuleType:
+    """The module `brax.envs`. Raises `ValueError` where it is missing."""
+    try:
+        with quiet():
+            import brax.envs
+    except ImportError as error:
+        raise ValueError(f"env='brax:...' needs the package brax ({error}). Install it: pip install brax.") from error
+    return brax.envs
+
+
+def check_name(name: str) -> None:
+    """Raise `ValueError` unless Brax has an environment of this name, and is there."""
+    validate.one_of("env", f"brax:{name}", (f"brax:{known}" for known in load()._envs))
+
+
+def make_environment(
+    name: str, backend: str = "auto", obs_noise: float = 0.0, episode_steps: int = 1_000
+) -> Environment:
+    """The Brax environment called `name`.
+
+    Args:
+        name: as Brax registers it.
+        backend: one of Brax's engines, or `auto`: the environment's own choice.
+        obs_noise: standard deviation of Gaussian noise added to every observation entry, in raw units.
+        episode_steps: steps after which an episode is truncated.
+
+    Raises:
+        ValueError: an unknown name or backend, observations that are not one vector, or a bad number.
+    """
+    check_name(name)
+    validate.one_of("backend", backend, ("auto", *BACKENDS))
+    with quiet():
+        raw = load().get_environment(name, **({} if backend == "auto" else {"backend": backend}))
+        model = getattr(getattr(raw, "sys", None), "mj_model", None)
+        own = getattr(raw, "_backend", "jax")
+        return brax_like.make_environment(
+            _Quiet(raw), f"brax:{name}", own, obs_noise, episode_steps, model, lambda state: state.pipeline_state.q
+        )
+
+
+class _Quiet:
+    """A Brax environment that is traced without its warnings."""
+
+    def __init__(self, env: Any) -> None:
+        # Brax's own toy has no physics, so no time either.
+        self._env, self.action_size, self.dt = env, env.action_size, getattr(env, "dt", 1.0)
+
+    def reset(self, key: Any) -> Any:
+        with quiet():
+            return self._env.reset(key)
+
+    def step(self, state: Any, action: Any) -> Any:
+        with quiet():
+            return self._env.step(state, action)

@@ -1,0 +1,1 @@
+"""What runs the physics of a `Task`: one module per engine, with `BACKEND` and `make_environment(task, obs_noise)`."""

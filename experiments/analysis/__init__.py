@@ -1,0 +1,1 @@
+"""Finished runs: arrays in, tables and pictures out."""

@@ -1,0 +1,89 @@
+"""The tables of a comparison, in Markdown."""
+
+import statistics
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from experiments.analysis.calibration import DATA, HELD_OUT, UNSEEN
+from experiments.analysis.statistics import MEASURES, Group, interval
+from experiments.analysis.tables import markdown_table, number
+from experiments.runs.scene import Cells
+
+
+def coverage_table(groups: Sequence[Group], cells_of: Cells) -> str:
+    """A Markdown table: medians, ranges in brackets, and the mean height of the coverage curves with its interval."""
+    most = cells_of.reachable or cells_of.num_cells
+    seen = f"{cells_of.unit} of {cells_of.size}: median (range)"
+    head = ("method", "seeds", seen, "each seed", "all seen at step", "coverage over the run: mean, 95 %", "minutes")
+    lines = []
+    for one in groups:
+        cells = [outcome.cells for outcome in one.outcomes]
+        whole = [f"{outcome.reached[-1]:,}" for outcome in one.outcomes if outcome.cells == most]
+        lines.append(
+            (
+                *(f"`{one.label}`", str(len(cells)), f"{statistics.median(cells):g} ({min(cells)} to {max(cells)})"),
+                *(", ".join(map(str, cells)), ", ".join(whole) or "-", _percent(one)),
+                f"{statistics.median(outcome.minutes for outcome in one.outcomes):.1f}",
+            )
+        )
+    return markdown_table(head, lines)
+
+
+def belief_table(groups: Sequence[Group]) -> str | None:
+    """A Markdown table of what the beliefs said in the second half of the runs, means over seeds; None without any."""
+    pairs = (
+        ("own reward, imagined", "policy/imagined_reward"),
+        ("own reward", "intrinsic_reward"),
+        ("variance", "variance"),
+        ("divergence", "divergence"),
+    )
+    head = ("method", "model error", *(f"{title}: mean, 95th percentile" for title, _ in pairs))
+    lines = []
+    for one in groups:
+        means = {name: _mean([outcome.measures.get(name) for outcome in one.outcomes]) for name in MEASURES}
+        if means["model_error"] is not None:
+            shown = (f"{number(means[name])}, {number(means[f'{name}_p95'])}" for _, name in pairs)
+            lines.append((f"`{one.label}`", number(means["model_error"]), *shown))
+    return markdown_table(head, lines) if lines else None
+
+
+def calibration_table(groups: Sequence[Group]) -> str | None:
+    """A Markdown table of what `experiments.calibrate` found, geometric means of ratios and means of the rest over the
+    seeds that were asked; None where none was.
+    """
+    kinds = (("data", DATA), ("new", HELD_OUT), ("unseen", UNSEEN))
+    head = (
+        *("method", "seeds"),
+        *(f"error / variance, {short}" for short, _ in kinds),
+        *(f"rank correlation, {short}" for short, _ in kinds),
+        "unseen told from data",
+    )
+    lines = []
+    for one in groups:
+        asked = [outcome.calibration for outcome in one.outcomes if outcome.calibration]
+        if not asked:
+            continue
+        sets = [[found["sets"].get(kind, {}) for found in asked] for _, kind in kinds]
+        ratios = [[found.get("error_per_variance") for found in kind] for kind in sets]
+        told = _mean([found["unseen_told_from_data"] for found in asked])
+        lines.append(
+            (
+                *(f"`{one.label}`", str(len(asked))),
+                *(number(_mean([value and float(np.log(value)) for value in kind], np.exp)) for kind in ratios),
+                *(number(_mean([found.get("rank") for found in kind])) for kind in sets),
+                "-" if told is None else f"{told:.0%}",
+            )
+        )
+    return markdown_table(head, lines) if lines else None
+
+
+def _mean(values: Sequence[float | None], then: Callable[[float], float] = float) -> float | None:
+    """Mean of the values that there are."""
+    known = [value for value in values if value is not None]
+    return then(float(np.mean(known))) if known else None
+
+
+def _percent(one: Group) -> str:
+    mean, half_width = interval(one.coverage.mean(axis=1))
+    return f"{mean:.0%}" if half_width is None else f"{mean:.0%} +- {100 * half_width:.0f}"

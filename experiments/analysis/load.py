@@ -1,0 +1,83 @@
+"""Finished runs read back from their directories."""
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from experiments.runs.config import RunConfig
+from experiments.runs.directory import RunDirectory, Status
+from experiments.runs.errors import RunError
+from experiments.runs.scene import Scene
+
+
+class LoadedRun(NamedTuple):
+    """A run, or its first steps as if it had ended there."""
+
+    directory: RunDirectory
+    config: RunConfig
+    rows: list[dict[str, Any]]
+    scene: Scene
+
+
+def load(path: Path, until: int | None = None) -> LoadedRun:
+    """A finished run, or its first `until` steps.
+
+    Raises:
+        RunError: `path` holds no run, or one that has not come that far.
+        ValueError: its configuration is damaged.
+    """
+    directory = RunDirectory(path)
+    config, rows = directory.config(), directory.rows()
+    wanted = until or config.steps
+    last = max((row["step"] for row in rows), default=0)
+    if directory.status() is Status.DIVERGED and last < wanted:
+        raise RunError(f"{path} diverged at step {last}, before step {wanted}. Compare with --until={last} or less.")
+    if last < wanted:
+        raise RunError(f"{path} stands at step {last} of {wanted}. Finish it with --resume first.")
+    scene = scene_of(directory)
+    if until is None:
+        return LoadedRun(directory, config, rows, scene)
+    rows = [row for row in rows if row["step"] <= until]
+    return LoadedRun(directory, dataclasses.replace(config, steps=until), rows, scene)
+
+
+def scene_of(directory: RunDirectory) -> Scene:
+    """What reports must know of a run's environment; of a run from before that was saved, by building it.
+
+    Raises:
+        RunError: there is no run, or its file is damaged.
+        ValueError: its environment cannot be built here.
+    """
+    saved = directory.scene()
+    if saved is not None:
+        return saved
+    from experiments.training import build
+
+    config = directory.config()
+    env = build.make_env(config)
+    return build.make_scene(config, env, build.make_agent(config, env))
+
+
+def series(rows: Sequence[dict[str, Any]], field: str) -> tuple[np.ndarray, np.ndarray]:
+    """One field of a run's rows: `(steps [T], values [S, T])`, NaN where a row has none."""
+    steps = sorted({row["step"] for row in rows})
+    seeds = sorted({row["seed"] for row in rows})
+    values = np.full((len(seeds), len(steps)), np.nan)
+    column = {step: t for t, step in enumerate(steps)}
+    line = {seed: i for i, seed in enumerate(seeds)}
+    for row in rows:
+        if row.get(field) is not None:
+            values[line[row["seed"]], column[row["step"]]] = row[field]
+    return np.array(steps), values
+
+
+def held(values: np.ndarray) -> np.ndarray:
+    """Values `[S, T]` with the last one that there was in place of each NaN that comes later.
+
+    A seed that diverged has no rows from then on: what it has seen by then, it has seen.
+    """
+    at = np.where(np.isfinite(values), np.arange(values.shape[1]), 0)
+    return np.take_along_axis(values, np.maximum.accumulate(at, axis=1), axis=1)

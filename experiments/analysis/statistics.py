@@ -1,0 +1,141 @@
+"""Runs as numbers that can be compared: outcomes by seed, groups by method, intervals over seeds."""
+
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import stats
+
+from experiments.analysis.load import LoadedRun, held, load, series
+from experiments.runs.errors import RunError
+
+POINTS = 100
+"""Points of a comparison, evenly spaced: runs of different rounds meet there."""
+
+
+MEASURES = (
+    *("intrinsic_reward", "intrinsic_reward_p95", "policy/imagined_reward", "policy/imagined_reward_p95"),
+    *("variance", "variance_p95", "divergence", "divergence_p95", "model_error"),
+)
+"""Fields of a run's rows that tell of its belief, on the transitions just met and not learned from yet."""
+
+
+class Outcome(NamedTuple):
+    """One seed of one run."""
+
+    seed: int
+    cells: int
+    """Coverage cells seen at the end."""
+    reached: tuple[int, ...]
+    """The step (end of its round) at which each further cell was seen: the first entry is the first cell's."""
+    minutes: float
+    """Wall time of its run; of seeds carried side by side, each one's share."""
+    measures: dict[str, float]
+    """`MEASURES`, those that there are: means over the rounds of the second half."""
+    calibration: dict[str, Any] | None
+    """What `experiments.calibrate` found of this seed at this step, if it was asked."""
+    last_return: float | None
+    """Of the last episode that ended; None: no task, or no episode ended."""
+
+
+class Group(NamedTuple):
+    """All seeds of one method."""
+
+    label: str
+    outcomes: list[Outcome]
+    steps: np.ndarray
+    """`[T]`"""
+    coverage: np.ndarray
+    """`[S, T]`, 0 to 1."""
+    variance: np.ndarray
+    """Equation 1 on the transitions just met, whatever the method's own reward, `[S, T]`; NaN without a belief."""
+
+
+class Interval(NamedTuple):
+    """A mean and the 95 % confidence interval around it."""
+
+    mean: float
+    half_width: float | None
+    """Student's t with one degree of freedom less than there are seeds. None: of one seed there is none."""
+
+
+def interval(values: np.ndarray) -> Interval:
+    """Mean of `values [S]` and its 95 % interval by Student's t: wide where seeds are few, as it should be."""
+    count = len(values)
+    if count < 2:
+        return Interval(float(np.mean(values)), None)
+    error = np.std(values, ddof=1) / np.sqrt(count)
+    return Interval(float(np.mean(values)), float(stats.t.ppf(0.975, count - 1) * error))
+
+
+def outcomes(run: LoadedRun) -> list[Outcome]:
+    """What became of each seed of a run."""
+    config, rows, found = run.config, run.rows, []
+    calibrated = run.directory.calibration() or {"step": None, "seeds": []}
+    asked = {one["seed"]: one for one in calibrated["seeds"]} if calibrated["step"] == config.steps else {}
+    for seed in range(config.seed, config.seed + config.num_seeds):
+        own = [row for row in rows if row["seed"] == seed]
+        cells = own[-1]["cells"]
+        reached = tuple(next(row["step"] for row in own if row["cells"] >= count) for count in range(1, cells + 1))
+        late = [row for row in own if 2 * row["step"] > config.steps]
+        measures = {name: [row[name] for row in late if row.get(name) is not None] for name in MEASURES}
+        means = {name: float(np.mean(values)) for name, values in measures.items() if values}
+        minutes = own[-1]["wall_time"] / 60 / config.num_seeds
+        returns = [row["episode_return"] for row in own if row.get("episode_return") is not None]
+        last_return = returns[-1] if returns else None
+        found.append(Outcome(seed, cells, reached, minutes, means, asked.get(seed), last_return))
+    return found
+
+
+def group(
+    runs: Sequence[Path], until: int | None = None, names: Sequence[str | None] | None = None
+) -> tuple[LoadedRun, list[Group]]:
+    """The runs by name, in the order in which the names come; of each the first `until` steps, or all.
+
+    Args:
+        runs: directories.
+        until: steps to compare.
+        names: of each run, what it counts under; None: its method.
+
+    Returns:
+        The first run, and a group for each name.
+
+    Raises:
+        RunError: runs differ in environment or number of steps, or a seed of a method comes twice.
+    """
+    loaded = [load(run, until) for run in runs]
+    first = loaded[0].config
+    named = [name or one.config.method for name, one in zip(names or [None] * len(loaded), loaded, strict=True)]
+    labels = list(dict.fromkeys(named))
+    # A first point before the first round has nothing to show: rounds are as long as the warm-up at most.
+    grid = np.unique(np.linspace(first.steps / POINTS, first.steps, POINTS).round().astype(int))
+    grid = grid[grid >= max(min(row["step"] for row in one.rows) for one in loaded)]
+    groups = []
+    for label in labels:
+        own: list[Outcome] = []
+        curves, variances = [], []
+        for path, name, run in zip(runs, named, loaded, strict=True):
+            config = run.config
+            if (config.env, config.steps) != (first.env, first.steps):
+                raise RunError(
+                    f"{path} is of {config.env} over {config.steps} steps, "
+                    f"{runs[0]} of {first.env} over {first.steps}. "
+                    "Compare runs of one environment and one length."
+                )
+            if name != label:
+                continue
+            steps, covered = series(run.rows, "coverage")
+            at = np.searchsorted(steps, grid, side="right") - 1
+            curves.append(held(covered)[:, at])
+            variances.append(series(run.rows, "variance")[1][:, at])
+            own += outcomes(run)
+        seeds = [outcome.seed for outcome in own]
+        if len(set(seeds)) < len(seeds):
+            raise RunError(
+                f"{label}: seed {statistics.mode(seeds)} comes twice. Give each seed of a method once, "
+                "or NAME=RUN to compare settings."
+            )
+        groups.append(Group(label, own, grid, np.concatenate(curves), np.concatenate(variances)))
+    return loaded[0], groups

@@ -1,0 +1,95 @@
+"""`python -m experiments.calibrate RUN ...`: what the belief of a finished run knows, and whether it knows that.
+
+A belief is asked about three kinds of real transitions: the data it was fitted to, what its own agent meets in episodes
+that it was not fitted to, and uniform actions elsewhere, in every part of the environment, been to or not. For each,
+the models' disagreement (equation 1 of Ratzlaff et al. 2020) is held against the squared error of their mean.
+"""
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments import runtime
+from experiments.analysis import figures
+from experiments.analysis.calibration import FEWEST, Judged, record
+from experiments.analysis.load import scene_of
+from experiments.analysis.tables import number, text_table
+from experiments.runs.directory import RunDirectory
+from experiments.runs.errors import RunError
+from experiments.training import build, loop
+from experiments.training.ask import ask
+
+
+def write(run: Path, until: int | None = None) -> str:
+    """Ask the belief of a run as it stood at its last checkpoint, or at the last one up to the step `until`.
+
+    Returns:
+        A table; what was found and a picture are written to the run's directory.
+
+    Raises:
+        RunError: there is no run, no checkpoint, or no writing.
+        ValueError: the method has no belief.
+    """
+    directory = RunDirectory(run)
+    config = directory.config()
+    own_env = build.make_env(config)
+    explorer = build.make_agent(config, own_env)
+    state, step = loop.last_state(directory, own_env, explorer, until)
+    env, unit = build.on_host(config, own_env), scene_of(directory).variance_unit
+    judged = [ask(config, env, explorer, state, index) for index in range(config.num_seeds)]
+    seeds = [{"seed": config.seed + index, **record(own, env.coverage.num_cells)} for index, own in enumerate(judged)]
+    title = f"{config.method} on {config.env} after {step:,} steps"
+    found = {"method": config.method, "env": config.env, "step": step, "unit": unit, "seeds": seeds}
+    file, picture = directory.write_calibration(found), directory.picture("calibration")
+    groups = [
+        figures.Reliability(name, one.variance, one.error)
+        for name, one in judged[0].items()
+        if len(one.error) >= FEWEST
+    ]
+    figures.plot_calibration(
+        picture, groups, seeds[0].get("cells"), unit=unit, title=f"{title}, seed {config.seed}", fewest=FEWEST
+    )
+    shares = {one["seed"]: one["unseen_told_from_data"] for one in seeds}
+    told_apart = [
+        f"seed {seed}: variance tells cells not seen from its data {share:.0%} of the time"
+        for seed, share in shares.items()
+        if share is not None
+    ]
+    return "\n".join(
+        [title, f"unit: {unit}", "", _table(seeds, judged), "", *told_apart, f"written to {file}, {picture}"]
+    )
+
+
+def _table(seeds: Sequence[Mapping[str, Any]], judged: Sequence[dict[str, Judged]]) -> str:
+    head = ("seed", "transitions", "count", "squared error", "variance", "error / variance", "rank correlation")
+    lines = []
+    for found, own in zip(seeds, judged, strict=True):
+        for name, one in found["sets"].items():
+            ratio = one["error_per_predictive" if np.any(own[name].stated) else "error_per_variance"]
+            numbers = (one["error"], one["variance"], ratio, one["rank"])
+            lines.append((str(found["seed"]), name, f"{one['num']:,}", *map(number, numbers)))
+    return text_table(head, lines)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Ask each run; the exit status is 0, 1 with a message, or 2 for bad input."""
+    parser = argparse.ArgumentParser(prog="python -m experiments.calibrate", description=__doc__)
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="directories of runs with a checkpoint")
+    parser.add_argument("--until", type=int, help="ask at the latest checkpoint up to this step (default: the last)")
+    arguments = parser.parse_args(argv)
+    runtime.use_compilation_cache()
+    try:
+        for run in arguments.runs:
+            print(write(run, arguments.until) + "\n", flush=True)
+    except (RunError, ValueError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""What a run is: its specification, and its directory on disk."""

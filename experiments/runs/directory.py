@@ -1,0 +1,292 @@
+"""The directory of a run: the only place that knows what its files are called.
+
+| file | what |
+| --- | --- |
+| `config.json` | the specification: settings, format, parent, identity |
+| `versions.json` | versions of everything that results depend on, when the run began |
+| `scene.json` | what coverage counts, the floor plan, units: what reports need of the environment |
+| `metrics.jsonl` | a row per round and seed; compressed, `metrics.jsonl.gz`, in a run that was kept |
+| `checkpoints/` | the latest states, whole |
+| `tensorboard/` | the rows as TensorBoard events |
+| `walk.npz` | where each step began |
+| `outcome.json` | how the run ended; the last file to be written |
+| `calibration.json` | what its belief knows, if that was asked |
+| `*.png` | pictures |
+"""
+
+import enum
+import gzip
+import json
+import os
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments import runtime
+from experiments.runs import scene as scenes
+from experiments.runs import spec as specs
+from experiments.runs.checkpoint import Checkpoints
+from experiments.runs.config import RunConfig
+from experiments.runs.errors import RunError, disk_error
+from experiments.runs.files import replacing, write_text
+from experiments.runs.metrics import MetricsLog, read_metrics
+from experiments.runs.scene import Scene
+from experiments.runs.spec import RunSpec
+from experiments.runs.tensorboard import TensorBoardLog
+
+CONFIG, VERSIONS, SCENE, OUTCOME = "config.json", "versions.json", "scene.json", "outcome.json"
+METRICS, PACKED_METRICS, WALK = "metrics.jsonl", "metrics.jsonl.gz", "walk.npz"
+CHECKPOINTS, TENSORBOARD = "checkpoints", "tensorboard"
+CALIBRATION, OLD_CALIBRATION = "calibration.json", "posterior.json"
+KEPT = (CONFIG, VERSIONS, SCENE, OUTCOME, CALIBRATION, OLD_CALIBRATION)
+"""Files that `RunDirectory.keep` copies as they are, those that there are."""
+
+
+class Status(enum.Enum):
+    """How far a run has come."""
+
+    ABSENT = "absent"
+    """There is no run here."""
+    PARTIAL = "partial"
+    """It can be resumed."""
+    FINISHED = "finished"
+    """All its steps are taken."""
+    DIVERGED = "diverged"
+    """Every seed ended in numbers that are not finite. Resumed, it would end there again."""
+
+
+class RunDirectory:
+    """The directory of a run.
+
+    Args:
+        path: where it is; nothing is made until something is written.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+
+    def __str__(self) -> str:
+        """The path."""
+        return str(self.path)
+
+    def status(self) -> Status:
+        """How far the run has come.
+
+        Raises:
+            RunError: its files cannot be read.
+            ValueError: its configuration is damaged.
+        """
+        if not (self.path / CONFIG).is_file():
+            return Status.ABSENT
+        try:
+            return Status(json.loads((self.path / OUTCOME).read_text())["status"])
+        except FileNotFoundError:
+            pass
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise self._unreadable(OUTCOME, error, "remove it, and finish with --resume") from error
+        # Before there were outcomes the walk was a run's last file; a kept run has neither.
+        if self.is_kept() or (self.path / WALK).is_file():
+            last = max((row["step"] for row in self.rows()), default=0)
+            return Status.FINISHED if last >= self.config().steps else Status.PARTIAL
+        return Status.PARTIAL
+
+    def is_kept(self) -> bool:
+        """Whether this is what `keep` left of a run: it can be read, and not resumed."""
+        return (self.path / PACKED_METRICS).exists() and not (self.path / METRICS).exists()
+
+    def entries(self) -> set[str] | None:
+        """Names of what lies here, but for drafts of files that were never finished; None: there is no directory.
+
+        Raises:
+            RunError: it cannot be read.
+        """
+        try:
+            return {entry.name for entry in self.path.iterdir()} if self.path.is_dir() else None
+        except OSError as error:
+            raise disk_error("look for a run", self.path, error) from error
+
+    def holds_only_scraps(self) -> bool:
+        """Whether what lies here is what a run that was killed while it started may have left."""
+        return not {name for name in self.entries() or () if ".tmp" not in name and name not in (VERSIONS, SCENE)}
+
+    # What a run is.
+
+    def spec(self) -> RunSpec:
+        """The specification.
+
+        Raises:
+            RunError: there is no run, or one of a newer format.
+            ValueError: its `config.json` is damaged, or has been changed.
+        """
+        path = self.path / CONFIG
+        try:
+            return specs.from_json(path.read_text(), str(path), as_written=True)
+        except (OSError, UnicodeDecodeError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise RunError(f"{self.path} holds no run: cannot read {path} ({reason}).") from error
+
+    def config(self) -> RunConfig:
+        """The configuration. Raises as `spec`."""
+        return self.spec().config
+
+    def scene(self) -> Scene | None:
+        """What reports must know of the environment; None in a run of before that was saved.
+
+        Raises:
+            RunError: the file is damaged.
+        """
+        try:
+            return scenes.from_json((self.path / SCENE).read_text())
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError) as error:
+            raise self._unreadable(SCENE, error, "put back a copy of the file") from error
+
+    def changed_versions(self) -> list[str]:
+        """What has another version now than when the run began, as `name: then -> now`."""
+        try:
+            then: dict[str, Any] = json.loads((self.path / VERSIONS).read_text())
+        except (OSError, ValueError):
+            return []
+        now = runtime.versions()
+        return [f"{name}: {then[name]} -> {version}" for name, version in now.items() if then.get(name) != version]
+
+    # What it came to.
+
+    def rows(self) -> list[dict[str, Any]]:
+        """All rows. Raises `RunError` if they cannot be read."""
+        return read_metrics(self.path / METRICS)
+
+    def walk(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where each step began, `[S, steps, 2]` [m], and the step of its episode that it was, `[S, steps]`.
+
+        Raises:
+            RunError: the file cannot be read.
+        """
+        try:
+            with np.load(self.path / WALK) as walk:
+                return walk["positions"], walk["episode_steps"]
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise self._unreadable(WALK, error, f"remove it and {OUTCOME}, and finish with --resume") from error
+
+    def calibration(self) -> dict[str, Any] | None:
+        """What `experiments.calibrate` found; None: it has not been asked.
+
+        Raises:
+            RunError: the file cannot be read.
+        """
+        for name in (CALIBRATION, OLD_CALIBRATION):
+            if (self.path / name).exists():
+                try:
+                    found = json.loads((self.path / name).read_text())
+                    if not isinstance(found.get("step"), int) or not isinstance(found.get("seeds"), list):
+                        raise ValueError("it lacks step or seeds")
+                    return found
+                except (OSError, ValueError, AttributeError) as error:
+                    again = f"python -m experiments.calibrate {self.path}"
+                    raise self._unreadable(name, error, again) from error
+        return None
+
+    def checkpoints(self) -> Checkpoints:
+        """Its checkpoints."""
+        return Checkpoints(self.path / CHECKPOINTS)
+
+    # Writing.
+
+    def begin(self, spec: RunSpec, scene: Scene) -> None:
+        """Save what the run is; what is there already stays as it is.
+
+        Raises:
+            RunError: the disk is full or cannot be written.
+        """
+        texts = {
+            VERSIONS: json.dumps(runtime.versions(), indent=2) + "\n",
+            SCENE: scenes.to_json(scene),
+            CONFIG: specs.to_json(spec),  # Last: with it, this is a run.
+        }
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            for name, text in texts.items():
+                if not (self.path / name).exists():
+                    write_text(self.path / name, text)
+        except OSError as error:
+            raise disk_error("start the run", self.path, error, "start it again") from error
+
+    def metrics_log(self) -> MetricsLog:
+        """The log that rows are appended to."""
+        return MetricsLog(self.path / METRICS)
+
+    def tensorboard_log(self, num_seeds: int, after_step: int | None) -> TensorBoardLog:
+        """The log of TensorBoard events; `after_step` as `TensorBoardLog` has it."""
+        return TensorBoardLog(self.path / TENSORBOARD, num_seeds=num_seeds, after_step=after_step)
+
+    def write_walk(self, positions: np.ndarray, episode_steps: np.ndarray) -> None:
+        """Save where each step began. Raises `RunError` if it cannot be written."""
+
+        def write(draft: Path) -> None:
+            with draft.open("wb") as file:
+                np.savez_compressed(file, positions=positions, episode_steps=episode_steps)
+
+        self._write(WALK, write, "write the walk", "finish with --resume")
+
+    def write_outcome(self, status: Status, seeds: Mapping[int, Mapping[str, Any]]) -> None:
+        """Save how the run ended.
+
+        Args:
+            status: finished or diverged.
+            seeds: of each seed that diverged, `step` and `what`.
+
+        Raises:
+            RunError: it cannot be written.
+        """
+        text = json.dumps({"status": status.value, "diverged": {str(seed): dict(how) for seed, how in seeds.items()}})
+        self._write(OUTCOME, lambda draft: draft.write_text(text + "\n"), "write the outcome", "finish with --resume")
+
+    def write_calibration(self, found: Mapping[str, Any]) -> Path:
+        """Save what the belief knows, and give the file. Raises `RunError` if it cannot be written."""
+        text = json.dumps(found, indent=2) + "\n"
+        self._write(CALIBRATION, lambda draft: draft.write_text(text), "write what the belief knows", "")
+        return self.path / CALIBRATION
+
+    def picture(self, name: str) -> Path:
+        """Where the picture called `name` is."""
+        return self.path / f"{name}.png"
+
+    @property
+    def metrics_path(self) -> Path:
+        """Where the rows are, for people."""
+        return self.path / METRICS
+
+    def keep(self, directory: Path) -> None:
+        """Copy what comparisons read, the rows compressed, to a directory of the run's name: some 30 kB.
+
+        Raises:
+            OSError: it cannot be read or written.
+        """
+        to = directory / self.path.resolve().name
+        to.mkdir(parents=True, exist_ok=True)
+        if to.resolve() == self.path.resolve():
+            return
+        for name in KEPT:
+            if (self.path / name).exists():
+                with replacing(to / name) as draft:
+                    draft.write_bytes((self.path / name).read_bytes())
+        with replacing(to / PACKED_METRICS) as draft:
+            if self.is_kept():
+                draft.write_bytes((self.path / PACKED_METRICS).read_bytes())
+            else:
+                # Without the time of day, so that the same run gives the same bytes.
+                draft.write_bytes(gzip.compress((self.path / METRICS).read_bytes(), mtime=0))
+
+    def _write(self, name: str, write: Callable[[Path], Any], doing: str, then: str) -> None:
+        try:
+            with replacing(self.path / name) as draft:
+                write(draft)
+        except OSError as error:
+            raise disk_error(doing, self.path, error, then) from error
+
+    def _unreadable(self, name: str, error: BaseException, remedy: str) -> RunError:
+        return RunError(f"cannot read {self.path / name}: {error}. What to do: {remedy}.")

@@ -1,0 +1,162 @@
+"""Flags from configurations: every field of a dataclass is one, with its docstring as help.
+
+The only file that knows tyro. Values are parsed here and checked by the configurations themselves, so that a bad one
+gets the same message on the command line as in a file.
+"""
+
+import ast
+import dataclasses
+import difflib
+import functools
+import inspect
+import textwrap
+import typing
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Annotated, Any, Literal, NamedTuple, get_args, get_origin
+
+from experiments.runs.errors import RunError
+
+try:
+    import tyro
+except ImportError as error:
+    raise RunError('the command line needs tyro. What to do: pip install -e ".[experiments]".') from error
+
+
+class Layout(NamedTuple):
+    """How the fields of configurations become flags."""
+
+    unprefixed: Sequence[str] = ()
+    """Fields that are dataclasses and whose own fields are flags without the field's name before them."""
+    choices: Mapping[str, Sequence[str]] = {}
+    """Names to list in the help of a text field."""
+    first: Collection[str] = ()
+    """Fields whose flags `--help` shows first, within the dataclasses that have no prefix."""
+    moved: Mapping[str, str] = {}
+    """Flags that there were once -> what to use in their place."""
+
+
+def option(argv: Sequence[str], name: str) -> str | None:
+    """The value of `--name VALUE` or `--name=VALUE`; the last one given.
+
+    Example:
+        >>> option(["--env=nchain", "--env", "acrobot"], "env")
+        'acrobot'
+    """
+    found = None
+    for i, word in enumerate(argv):
+        if word == f"--{name}" and i + 1 < len(argv):
+            found = argv[i + 1]
+        elif word.startswith(f"--{name}="):
+            found = word.partition("=")[2]
+    return found
+
+
+def given(argv: Sequence[str]) -> list[str]:
+    """The flags of a command line as paths of fields: `--sac.batch-size=8` is `sac.batch_size`.
+
+    Example:
+        >>> given(["--sac.batch-size=8", "--fit.no-restart", "--seed", "-1"])
+        ['sac.batch_size', 'fit.restart', 'seed']
+    """
+    names = [word[2:].partition("=")[0].replace("-", "_") for word in argv if word.startswith("--")]
+    return [".".join((*group, last.removeprefix("no_"))) for *group, last in (name.split(".") for name in names)]
+
+
+def parse(
+    argv: Sequence[str],
+    groups: Sequence[Any],
+    *,
+    prog: str,
+    description: str,
+    layout: Layout,
+) -> list[dict[str, Any]]:
+    """Read flags.
+
+    Args:
+        argv: the words after the program's name.
+        groups: dataclasses; their values are the flags' defaults.
+        prog: the program's name.
+        description: what it does, for `--help`.
+        layout: how fields become flags.
+
+    Returns:
+        The values of each of `groups`, as nested dictionaries.
+
+    Raises:
+        ValueError: a flag that does not exist, naming the nearest.
+        SystemExit: with 0 after `--help`, with 2 for a value of the wrong type.
+    """
+    names = [f"group_{i}" for i in range(len(groups))]
+    mirrors = [_mirror(group, layout, top=True) for group in groups]
+    fields = [(name, _group(mirror), mirror()) for name, mirror in zip(names, mirrors, strict=True)]
+    arguments = dataclasses.make_dataclass("Arguments", fields, frozen=True)
+    parsed, unknown = tyro.cli(arguments, prog=prog, description=description, args=list(argv), return_unknown_args=True)
+    for word in unknown:
+        name = word.partition("=")[0].replace("_", "-")
+        if name in layout.moved:
+            raise ValueError(f"{word} is no setting any more. Allowed: {layout.moved[name]}.")
+        known = [flag for group in groups for flag in _flags(group, layout.unprefixed)]
+        nearest = difflib.get_close_matches(name, known, n=1)
+        hint = f" Did you mean {nearest[0]}?" if nearest else ""
+        raise ValueError(f"{word} is not known.{hint} Allowed: what {prog} --help lists.")
+    return [dataclasses.asdict(getattr(parsed, name)) for name in names]
+
+
+def _flags(config: Any, unprefixed: Sequence[str], prefix: str = "--") -> Iterator[str]:
+    """The flags of a dataclass's fields."""
+    for item in dataclasses.fields(config):
+        value, name = getattr(config, item.name), item.name.replace("_", "-")
+        if dataclasses.is_dataclass(value):
+            yield from _flags(value, unprefixed, prefix if item.name in unprefixed else f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}"
+
+
+def _group(mirror: type) -> Any:
+    return Annotated[mirror, tyro.conf.arg(name="")]
+
+
+def _mirror(config: Any, layout: Layout, *, top: bool = False) -> type:
+    """A dataclass with the fields of `config`, its values as defaults, and no checks."""
+    documents, hints = document(type(config)), typing.get_type_hints(type(config))
+    fields = []
+    for item in sorted(
+        dataclasses.fields(config), key=lambda item: bool(layout.first) and item.name not in layout.first
+    ):
+        value = getattr(config, item.name)
+        if dataclasses.is_dataclass(value):
+            # Only the fields of what has no prefix are sorted.
+            inner = _mirror(value, layout if item.name in layout.unprefixed else layout._replace(first=()))
+            fields.append((item.name, _group(inner) if item.name in layout.unprefixed else inner, inner()))
+            continue
+        hint, names = hints[item.name], layout.choices.get(item.name)
+        if get_origin(hint) is Literal:
+            # As text: the configuration's own check knows the nearest match.
+            hint, names = str, get_args(hint)
+        settings: dict[str, Any] = {"help": documents.get(item.name)}
+        if names:
+            settings["metavar"] = "{" + ",".join(names) + "}"
+        if hint == str | None:
+            hint, value = str, value or ""
+            settings |= {"metavar": "PATH", "help_behavior_hint": ""}
+        elif hint is bool and top:
+            # Nobody asks for --no-version; a setting has both, whatever its default.
+            hint = tyro.conf.FlagCreatePairsOff[bool]
+            settings["help_behavior_hint"] = ""
+        fields.append((item.name, Annotated[hint, tyro.conf.arg(**settings)], value))
+    mirror = dataclasses.make_dataclass(type(config).__name__, fields, frozen=True)
+    mirror.__doc__ = type(config).__doc__
+    return mirror
+
+
+@functools.cache
+def document(config_type: type) -> dict[str, str]:
+    """The docstrings below the fields of a dataclass, each on one line."""
+    (tree,) = ast.parse(textwrap.dedent(inspect.getsource(config_type))).body
+    assert isinstance(tree, ast.ClassDef)
+    found = {}
+    for field, below in zip(tree.body, tree.body[1:], strict=False):
+        match field, below:
+            case ast.AnnAssign(target=ast.Name(name)), ast.Expr(ast.Constant(str(text))):
+                found[name] = " ".join(text.split())
+    return found

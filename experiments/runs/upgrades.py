@@ -1,0 +1,76 @@
+"""Configurations of older formats, as today's.
+
+Format 0, until November 2026: m stood twice (`imagination.num_models` beside `svgd.num_particles`, and for static
+networks alone), and `imagination` also configured methods that imagine nothing.
+"""
+
+import copy
+from collections.abc import Mapping
+from typing import Any
+
+from experiments.runs.config import RunConfig
+from jaxplore.methods import METHODS
+from jaxplore.validate import FieldError
+
+MOVED = {
+    "imagination.num_models": "svgd.num_particles (the generator's m) or ensemble.num_members (static networks)",
+    "reactive_updates": "reactive.updates",
+}
+"""Fields of the explorer that format 0 had -> where they are now."""
+
+
+def upgrade(data: Mapping[str, Any], start: RunConfig, found: int) -> dict[str, Any]:
+    """The fields of a configuration of format `found`, as today's format has them.
+
+    Args:
+        data: field -> value, as the file has it; what it leaves out is that of `start`.
+        start: the configuration that `data` changes.
+        found: its format.
+
+    Raises:
+        FieldError: a setting that cannot be expressed any more.
+    """
+    data = copy.deepcopy(dict(data))
+    explorer = data.get("explorer")
+    if found > 0 or not isinstance(explorer, dict):
+        return data
+    imagination = explorer.get("imagination", {})
+    if isinstance(imagination, dict):
+        _upgrade_models(explorer, imagination, start)
+        _upgrade_reactive(explorer, imagination, start)
+    return data
+
+
+def _upgrade_models(explorer: dict[str, Any], imagination: dict[str, Any], start: RunConfig) -> None:
+    """m stands once: particles of the generator, members of an ensemble."""
+    num = imagination.pop("num_models", None)
+    if num is None:
+        return
+    particles = explorer.get("svgd", {}).get("num_particles", start.explorer.svgd.num_particles)
+    reads = METHODS[start.method].reads(start.explorer)
+    if "svgd" in reads and num != particles:
+        allowed = f"explorer.svgd.num_particles={particles}, which is now the only m of a generator"
+        raise FieldError("explorer.imagination.num_models", num, allowed)
+    explorer.setdefault("ensemble", {}).setdefault("num_members", num)
+
+
+def _upgrade_reactive(explorer: dict[str, Any], imagination: dict[str, Any], start: RunConfig) -> None:
+    """Methods that imagine nothing have a configuration of their own."""
+    updates = explorer.pop("reactive_updates", None)
+    if "reactive" in explorer or (updates is None and not imagination):
+        return
+    old, now = start.explorer.imagination, start.explorer.reactive
+    was = {name: imagination.get(name, getattr(old, name)) for name in old.__dataclass_fields__}
+    # 0 stood for as many updates as imagination comes to.
+    if updates == 0 or (updates is None and now.updates == _num_updates(old.__dict__)):
+        updates = _num_updates(was)
+    explorer["reactive"] = {
+        "updates": now.updates if updates is None else max(1, updates),
+        **{name: was[name] for name in ("restart_every", "normalize_reward", "act_greedily")},
+    }
+
+
+def _num_updates(imagination: Mapping[str, Any]) -> int:
+    """Updates of the policy in a round, on real and on imagined data."""
+    trained = max(0, imagination["num_rollouts"] - imagination["num_random_rollouts"])
+    return imagination["real_updates"] + trained * imagination["updates_per_rollout"]

@@ -1,0 +1,242 @@
+"""The rounds of a run: environments step, the agent learns, everything is logged.
+
+The agent is one jitted program over all seeds. Environments on the device are stepped by another; for those on the
+host all seeds act in one.
+"""
+
+import dataclasses
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import numpy as np
+
+from envs.base import Environment
+from experiments.runs import console
+from experiments.runs.config import RunConfig
+from experiments.runs.directory import RunDirectory, Status
+from experiments.runs.errors import RunError
+from experiments.runs.spec import RunSpec
+from experiments.training import record
+from experiments.training.evaluate import make_evaluate
+from experiments.training.programs import NEWER, Programs, RunState, make_programs
+from jaxplore.exploration import Explorer
+from jaxplore.types import Transition
+
+
+def rounds(config: RunConfig, start: int) -> Iterator[tuple[int, int]]:
+    """The steps `(first, end)` of each round from `start` on: at most `steps_per_round` long, ending with the warm-up,
+    then at each multiple of `steps_per_round`, and with the run.
+    """
+    length, warm_up = config.explorer.steps_per_round, config.explorer.warm_up_steps
+    while start < config.steps:
+        end = min(warm_up, start + length) if start < warm_up else (start // length + 1) * length
+        end = min(end, config.steps)
+        yield start, end
+        start = end
+
+
+def due(every: int, first: int, end: int, steps: int) -> bool:
+    """Whether what happens every so many steps, and at the end of a run, happens at the end of a round. 0: never."""
+    return every > 0 and (end // every > first // every or end == steps)
+
+
+def run(spec: RunSpec, directory: RunDirectory, env: Environment, agent: Explorer, *, resume: bool = False) -> RunState:
+    """Carry out a run, from its latest checkpoint if `resume`, and write what comes of it to its directory.
+
+    Args:
+        spec: what to run.
+        directory: the run's.
+        env: the environment that `spec` names.
+        agent: the agent that `spec` names.
+        resume: whether to continue from the latest checkpoint; without one the run starts over.
+
+    Returns:
+        The last state.
+
+    Raises:
+        RunError: the disk fails, a checkpoint does not fit, or no seed is left whose numbers are finite. The latest
+            checkpoint is then whole.
+    """
+    session = Session(spec, directory, env, agent)
+    session.start(resume=resume)
+    try:
+        for first, end in rounds(spec.config, session.step):
+            session.round(first, end)
+    finally:
+        session.close()
+    directory.write_walk(session.state.positions, session.state.episode_steps)
+    directory.write_outcome(Status.FINISHED, session.diverged())
+    return session.state
+
+
+class Session:
+    """A run while it runs: what it is, how far it has come, and where it is written.
+
+    Args:
+        spec: what to run.
+        directory: where it is written.
+        env: the environment.
+        agent: the agent.
+    """
+
+    state: RunState
+    step: int
+    """Environment steps taken."""
+
+    def __init__(self, spec: RunSpec, directory: RunDirectory, env: Environment, agent: Explorer) -> None:
+        self.spec, self.directory, self.env = spec, directory, env
+        self.config: RunConfig = spec.config
+        self.programs: Programs = make_programs(spec.config, env, agent)
+        evaluates = spec.config.eval_every > 0
+        self.evaluate = make_evaluate(spec.config, env, agent, self.programs) if evaluates else None
+        self.checkpoints, self.log = directory.checkpoints(), directory.metrics_log()
+        self._announced: set[str] = set()
+
+    def start(self, *, resume: bool) -> None:
+        """Take up the state to continue from, and open what is written to."""
+        state, self.step, earlier = self.programs.init(), 0, 0.0
+        restored = self.checkpoints.restore_latest(state, newer=NEWER) if resume else None
+        if restored is not None:
+            self._check_identity(restored.meta)
+            self.step, state, earlier = restored.step, restored.state, restored.meta["wall_time"]
+        self.began = time.monotonic() - earlier
+        # Written in place; a restored array may be read-only.
+        arrays = ("visited", "positions", "episode_steps", "alive", "episode_return", "episode_length")
+        self.state = dataclasses.replace(
+            state, **{name: np.array(jax.device_get(getattr(state, name))) for name in arrays}
+        )
+        last = self.step if restored is not None else -1
+        self.log.truncate_after(last)
+        self.board = self.directory.tensorboard_log(self.config.num_seeds, last if resume else None)
+        self.progress = console.Progress(self.config.steps, start_step=self.step, num_cells=self.env.coverage.num_cells)
+        if resume:
+            known = f"Continuing from step {self.step:,}" if restored else "There is no checkpoint yet: starting over"
+            self.progress.say(known)
+
+    def _check_identity(self, meta: dict[str, Any]) -> None:
+        """A checkpoint is of the run that its directory says."""
+        saved = meta.get("identity")
+        if saved is not None and saved != self.spec.identity:
+            raise RunError(
+                f"the checkpoints in {self.directory} are of another run: their identity is {saved}, and the "
+                f"configuration has {self.spec.identity}. What to do: put back the run's own files, or start a new run "
+                "with another --out."
+            )
+
+    def close(self) -> None:
+        """End the progress bar and close the files."""
+        self.progress.close()
+        self.log.close()
+        self.board.close()
+
+    def diverged(self) -> dict[int, dict[str, Any]]:
+        """By seed when and by what its numbers stopped being finite."""
+        if self.state.alive.all():
+            return {}
+        rows = (row for row in self.directory.rows() if row.get("diverged"))
+        return {row["seed"]: {"step": row["step"], "what": row["diverged"]} for row in rows}
+
+    def round(self, first: int, end: int) -> None:
+        """Take the steps from `first` to `end`, learn, and log."""
+        began, config, programs = time.monotonic(), self.config, self.programs
+        warming_up, alive = first < config.explorer.warm_up_steps, self.state.alive.copy()
+        if programs.stepper.compiles:
+            self._announce("environment")
+        episode_step = programs.stepper.episode_step(self.state.env)
+        actors = programs.actors(self.state.explorer, warming_up)
+        env_state, transitions, valid = programs.collect(first, self.state.env, actors, end - first)
+        if end < config.explorer.warm_up_steps:
+            metrics, finite = {}, {}
+            learned = programs.absorb(self.state.explorer, transitions, valid)
+        else:
+            self._announce("learning")
+            obs = programs.stepper.obs(env_state)
+            learned, metrics, finite = programs.learn(first, self.state.explorer, transitions, valid, obs, end, alive)
+        metrics, finite = jax.device_get((metrics, finite))
+        broken = record.broken(finite, alive)
+        survivors = alive & np.array([not names for names in broken])
+        if not survivors.any():
+            # The state before the round, which what follows changes in place.
+            self._save(first, dataclasses.replace(self.state, explorer=learned))
+        transitions, valid = jax.device_get((transitions, valid))
+        own = self._remember(transitions, valid, episode_step, (first, end))
+        self.state = dataclasses.replace(self.state, explorer=learned, env=env_state, alive=survivors)
+        if self.evaluate is not None and due(config.eval_every, first, end, config.steps):
+            self._announce("evaluation")
+            metrics = {**metrics, **self.evaluate(end, learned)}
+        now = time.monotonic()
+        times = {"wall_time": round(now - self.began, 3), "steps_per_second": round((end - first) / (now - began), 3)}
+        rows = record.rows(config.seed, end, self.state.visited, alive, (own, metrics, broken, times))
+        self.log.append(rows)
+        self.board.append(rows)
+        self.progress.update(end, rows)
+        if not survivors.any():
+            self._give_up(broken, (first, end))
+        for row in rows:
+            if "diverged" in row:
+                self.progress.say(
+                    f"Seed {row['seed']} stops at step {end:,}: numbers that are not finite ({row['diverged']}). "
+                    "The others continue."
+                )
+        if due(config.checkpoint_every, first, end, config.steps):
+            self._save(end)
+        self.step = end
+
+    def _save(self, step: int, state: RunState | None = None) -> None:
+        self.log.sync()
+        meta = {"wall_time": time.monotonic() - self.began, "identity": self.spec.identity}
+        self.checkpoints.save(step, state or self.state, meta)
+
+    def _announce(self, what: str) -> None:
+        """Say once that something is about to be compiled."""
+        if what not in self._announced:
+            self._announced.add(what)
+            self.progress.say(f"Compiling the {what} step: up to a minute the first time, seconds from the cache later")
+
+    def _give_up(self, broken: list[list[str]], span: tuple[int, int]) -> None:
+        """End a run of which no seed has survived the round."""
+        self.log.sync()
+        self.directory.write_outcome(Status.DIVERGED, self.diverged())
+        names = list(dict.fromkeys(name for own in broken for name in own))
+        seeds = [self.config.seed + i for i, own in enumerate(broken) if own]
+        raise record.diverged_error(self.directory, names, seeds, span)
+
+    def _remember(
+        self, transitions: Transition, valid: np.ndarray, episode_step: np.ndarray, span: tuple[int, int]
+    ) -> list[dict[str, Any]]:
+        """Note in the state, in place, what the seeds that are alive saw and earned; what their rows have of it."""
+        state, count = self.state, span[1] - span[0]
+        # device_get: NumPy itself would wait for the result with Python's lock held, and hang.
+        marked = jax.device_get(self.programs.mark(state.visited, transitions.obs, valid))
+        state.visited[state.alive] = marked[state.alive]
+        done = (transitions.terminated | transitions.truncated)[:, :count]
+        if self.env.floor_plan is not None:
+            positions = transitions.obs[:, :count][..., list(self.env.floor_plan.position)]
+            record.walk(state, positions, record.steps_of_episodes(episode_step, done), span)
+        own: list[dict[str, Any]] = [{"dropped": int(count - kept.sum())} for kept in valid]
+        if self.env.spec.has_reward:
+            for row, ended in zip(own, record.episodes(state, transitions.reward[:, :count], done), strict=True):
+                row.update(record.earned(ended))
+        return own
+
+
+def last_state(
+    directory: RunDirectory, env: Environment, agent: Explorer, until: int | None = None
+) -> tuple[RunState, int]:
+    """The state in the latest checkpoint of a run, up to the step `until` if that is given, and its step.
+
+    Raises:
+        RunError: there is no such checkpoint, or none that fits the configuration.
+    """
+    config, checkpoints = directory.config(), directory.checkpoints()
+    programs = make_programs(config, env, agent)
+    restored = checkpoints.restore_latest(programs.stepper.abstract(programs.init), until, NEWER)
+    if restored is None and checkpoints.steps():
+        raise RunError(f"{directory} has no checkpoint up to step {until}, only of {checkpoints.steps()}.")
+    if restored is None:
+        raise RunError(
+            f"{directory} has no checkpoint yet: let the run continue for {config.checkpoint_every:,} steps."
+        )
+    return restored.state, restored.step

@@ -1,0 +1,156 @@
+"""The functions that a run calls: jitted, over all its seeds side by side.
+
+All randomness follows from the seed, the purpose and the step, so a run that is resumed is the run that was never
+interrupted.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from envs import coverage
+from envs.base import Coverage, Environment
+from envs.functional import all_finite
+from envs.stepper import Stepper, make_stepper
+from experiments.runs.config import RunConfig
+from jaxplore.exploration import Actor, Explorer, ExplorerState
+from jaxplore.types import Array, Key, Metrics, Transition
+
+INIT, RESET, COLLECT, LEARN, EVALUATE = range(5)
+"""What a key is for; folded into the seed's key before the step."""
+
+NEWER = {"alive": True, "episode_return": 0.0, "episode_length": 0}
+"""Leaves of a `RunState` that older checkpoints lack, and what they are then full of."""
+
+
+@struct.dataclass
+class RunState:
+    """All that a run carries; saved as it is. Leading axis `S` throughout."""
+
+    explorer: ExplorerState
+    env: Any
+    """As the stepper has it."""
+    visited: np.ndarray
+    """Coverage cells seen, bool `[S, cells]`."""
+    positions: np.ndarray
+    """Where each step began, from above, `[S, steps, 2]` [m]; `[S, 0, 2]` without a floor plan."""
+    episode_steps: np.ndarray
+    """The step of its episode that each step was, int32 `[S, steps]`."""
+    alive: np.ndarray
+    """Whether a seed's numbers have been finite so far, bool `[S]`. One that is not alive stays as it was."""
+    episode_return: np.ndarray
+    """Rewards of the episode that is under way, float64 `[S]`."""
+    episode_length: np.ndarray
+    """Its steps, int32 `[S]`."""
+
+
+class Programs(NamedTuple):
+    """The functions of a run."""
+
+    init: Callable[[], RunState]
+    actors: Callable[[ExplorerState, bool], Actor]
+    """`actors(explorer state, uniform) -> actors [S]`."""
+    collect: Callable[[int, Any, Actor, int], tuple[Any, Transition, Array]]
+    """`collect(step, env state, actors, num_steps) -> (env state, transitions [S, T], valid [S, T])`."""
+    absorb: Callable[[ExplorerState, Transition, Array], ExplorerState]
+    """Take transitions in; nothing is learned yet."""
+    learn: Callable[..., tuple[ExplorerState, Metrics, dict[str, Array]]]
+    """`learn(step, state, transitions, valid, obs, num_data, alive) -> (state, metrics, finite)`: assess transitions,
+    take them in, and improve. `finite` says of each metric and each part of the state whether it is, `[S]`; a seed
+    where one is not, or which is not alive, has the state that it had."""
+    mark: Callable[[np.ndarray, Array, Array], Array]
+    """`mark(visited [S, cells], obs [S, T, O], valid [S, T]) -> visited`."""
+    keys: Callable[[int, int], Key]
+    """`keys(purpose, step) -> keys [S]`."""
+    stepper: Stepper
+
+
+def make_programs(config: RunConfig, env: Environment, explorer: Explorer) -> Programs:
+    """Build the functions of a run. Nothing is compiled yet."""
+    seed_keys = jax.vmap(jax.random.key)(jnp.arange(config.seed, config.seed + config.num_seeds))
+    keys = jax.jit(functools.partial(derive_keys, seed_keys))
+    stepper = make_stepper(env, config.explorer.steps_per_round, explorer.act)
+    learn_all = jax.jit(functools.partial(learn_side_by_side, explorer), donate_argnums=1)
+    return Programs(
+        init=functools.partial(init_state, config, env, explorer, stepper, keys),
+        actors=jax.jit(jax.vmap(explorer.actor, in_axes=(0, None))),
+        collect=lambda step, *args: stepper.collect(keys(COLLECT, step), *args),
+        absorb=jax.jit(jax.vmap(explorer.observe), donate_argnums=0),
+        learn=lambda step, state, transitions, valid, *rest: learn_all(
+            keys(LEARN, step), state, (transitions, valid), *rest
+        ),
+        mark=jax.jit(jax.vmap(functools.partial(mark_cells, env.coverage))),
+        keys=keys,
+        stepper=stepper,
+    )
+
+
+def derive_keys(seed_keys: Key, purpose: int, step: int) -> Key:
+    """A key for each seed, `[S]`, that follows from the seed, the purpose and the step."""
+    return jax.vmap(lambda key: jax.random.fold_in(jax.random.fold_in(key, purpose), step))(seed_keys)
+
+
+def init_state(
+    config: RunConfig, env: Environment, explorer: Explorer, stepper: Stepper, keys: Callable[[int, int], Key]
+) -> RunState:
+    """The state that a run starts from."""
+    num_seeds, steps = config.num_seeds, config.steps if env.floor_plan else 0
+    return RunState(
+        env=stepper.init(keys(RESET, 0)),
+        explorer=jax.jit(jax.vmap(explorer.init))(keys(INIT, 0)),
+        visited=np.zeros((num_seeds, env.coverage.num_cells), bool),
+        positions=np.zeros((num_seeds, steps, 2), np.float32),
+        episode_steps=np.zeros((num_seeds, steps), np.int32),
+        alive=np.ones(num_seeds, bool),
+        episode_return=np.zeros(num_seeds, np.float64),
+        episode_length=np.zeros(num_seeds, np.int32),
+    )
+
+
+def learn_round(
+    explorer: Explorer,
+    key: Key,
+    state: ExplorerState,
+    rows: tuple[Transition, Array],
+    obs: Array,
+    num_data: Array,
+) -> tuple[ExplorerState, Metrics, dict[str, Array]]:
+    """One seed's round: assess its transitions and their validity (`rows`), take them in, improve."""
+    assess_key, improve_key = jax.random.split(key)
+    seen = explorer.assess(assess_key, state, *rows)
+    after, metrics = explorer.improve(improve_key, explorer.observe(state, *rows), obs, num_data)
+    # The state too: what the last update of a round broke would show in the next round's metrics only.
+    parts = {"belief": after.belief, "behaviour": after.behaviour, "normalizers": after.normalizers}
+    finite = {name: jnp.isfinite(value) for name, value in metrics.items()}
+    finite |= {f"the state of the {name}": all_finite(part) for name, part in parts.items()}
+    return after, {**seen, **metrics}, finite
+
+
+def learn_side_by_side(
+    explorer: Explorer,
+    keys: Key,
+    state: ExplorerState,
+    rows: tuple[Transition, Array],
+    obs: Array,
+    num_data: Array,
+    alive: Array,
+) -> tuple[ExplorerState, Metrics, dict[str, Array]]:
+    """`learn_round` of each seed. One that does not come out finite, or is not alive, keeps the state that it had."""
+    one = jax.vmap(functools.partial(learn_round, explorer), in_axes=(0, 0, 0, 0, None))
+    after, metrics, finite = one(keys, state, rows, obs, num_data)
+    good = jnp.all(jnp.stack(list(finite.values())), axis=0) & alive
+
+    def choose(new: Array, old: Array) -> Array:
+        return jnp.where(good.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
+
+    return jax.tree.map(choose, after, state), metrics, finite
+
+
+def mark_cells(cells: Coverage, visited: Array, obs: Array, valid: Array) -> Array:
+    """`visited [cells]` with the cells of the observations `[T, O]` marked where `valid [T]` is set."""
+    return coverage.update(visited, jnp.where(valid, jax.vmap(cells.cell)(obs), -1))

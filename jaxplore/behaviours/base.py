@@ -1,0 +1,160 @@
+"""What a behaviour is, and what those that train a learner share.
+
+A behaviour is a named tuple of pure functions. `improve` learns from a belief and the real data, `act` gives the
+action for the real environment.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxplore import normalizer, replay
+from jaxplore.beliefs.base import Belief
+from jaxplore.dynamics import Normalizers
+from jaxplore.learners.base import Learner
+from jaxplore.replay import Replay
+from jaxplore.signals.base import Score
+from jaxplore.types import Array, Key, Metrics, Transition, no_metrics
+
+LABEL_CHUNK = 1024
+"""Real transitions are given their intrinsic reward this many at a time, to bound memory."""
+
+
+class Experience(NamedTuple):
+    """What a behaviour learns from in one round."""
+
+    models: Any
+    """Models drawn from the belief, fixed for the round, so that the imagined task stands still."""
+    data: Replay[Transition]
+    """All real transitions."""
+    num_data: Array
+    """How many there are, int32; the same for every seed carried side by side."""
+    normalizers: Normalizers
+    obs: Array
+    """Where the real environment stands, `[O]`."""
+
+
+class Bonus(NamedTuple):
+    """An intrinsic reward that a behaviour itself gives, without a belief."""
+
+    score: Callable[[Any, Normalizers, Transition], Array]
+    """`score(state, normalizers, transitions [T, ...]) -> [T]`, of the behaviour's state."""
+    unit: str
+    """Of the score, for labels."""
+
+
+class Behaviour(NamedTuple):
+    """A behaviour as pure functions."""
+
+    init: Callable[[Key], Any]
+    """`init(key) -> state`."""
+    improve: Callable[[Key, Any, Experience], tuple[Any, Metrics]]
+    """`improve(key, state, experience) -> (state, metrics)`."""
+    actor: Callable[[Any], Any]
+    """`actor(state) -> actor`: the part of the state that acting needs, small enough to hand around."""
+    act: Callable[[Key, Any, Normalizers, Array], Array]
+    """`act(key, actor, normalizers, obs [..., O]) -> action [..., A]`, for the real environment."""
+    act_greedily: Callable[[Key, Any, Normalizers, Array], Array] | None = None
+    """The same without exploring, for evaluation: the action that the behaviour holds for the best. None: `act`."""
+    bonus: Bonus | None = None
+    """The intrinsic reward where the behaviour has one of its own."""
+
+
+def make_act(
+    learner: Learner, act_greedily: bool, normalize_obs: bool = True
+) -> Callable[[Key, Any, Normalizers, Array], Array]:
+    """`Behaviour.act` of a learner, which sees normalised observations or, if not `normalize_obs`, as they are."""
+
+    def act(key: Key, actor: Any, normalizers: Normalizers, obs: Array) -> Array:
+        seen = normalizer.normalize(normalizers.obs, obs) if normalize_obs else obs
+        return learner.act_greedily(actor, seen) if act_greedily else learner.act(key, actor, seen)
+
+    return act
+
+
+def renewed(key: Key, state: Any, init: Callable[[Key], Any], restart_every: int) -> Any:
+    """`state`, or a fresh one from `init` when its `age` is `restart_every` rounds. 0: never."""
+    if restart_every == 0:
+        return state
+    if restart_every == 1:
+        return init(key)
+    due = state.age == restart_every
+    return jax.tree.map(lambda new, old: jnp.where(due, new, old), init(key), state)
+
+
+def label(belief: Belief, score: Score, experience: Experience) -> Replay[Transition]:
+    """The real data with the intrinsic reward that the round's models give it.
+
+    Args:
+        belief: it must predict.
+        score: the intrinsic reward.
+        experience: models and data. Rows that the data do not hold get 0.
+
+    Returns:
+        The data, `reward` replaced.
+    """
+    data, normalizers = experience.data, experience.normalizers
+    capacity = replay.capacity(data)
+
+    def chunk(i: Array, rewards: Array) -> Array:
+        place = i * LABEL_CHUNK + jnp.arange(LABEL_CHUNK)
+        # The last chunk is filled up with rows already seen: a reward may compare rows, and empty ones are no data.
+        rows = jax.tree.map(lambda leaf: leaf[place % jnp.maximum(data.size, 1)], data.rows)
+        given = score(*belief.judge(experience.models, normalizers, rows), normalizers)
+        return rewards.at[jnp.where(place < data.size, place, capacity)].set(given, mode="drop")
+
+    num_chunks = (jnp.minimum(experience.num_data, capacity) + LABEL_CHUNK - 1) // LABEL_CHUNK
+    rewards = jax.lax.fori_loop(0, num_chunks, chunk, jnp.zeros(capacity))
+    return dataclasses.replace(data, rows=data.rows._replace(reward=rewards))
+
+
+class Lesson(NamedTuple):
+    """What a learner is trained on."""
+
+    draw: Callable[[Key], Transition]
+    """`draw(key) -> batch [B, ...]`."""
+    normalizers: Normalizers | None
+    """What observations are normalised with. None: they stay as they are."""
+    reward_std: Array
+    """What rewards are divided by, a scalar."""
+
+
+def train(
+    learner: Learner, key: Key, state: Any, lesson: Lesson, num_updates: int | Array, metrics: Metrics
+) -> tuple[Any, Metrics]:
+    """`num_updates` updates, which may be a traced number; `metrics` are returned where there are none."""
+    normalizers = lesson.normalizers
+
+    def see(obs: Array) -> Array:
+        return obs if normalizers is None else normalizer.normalize(normalizers.obs, obs)
+
+    def one_update(i: Array, carry: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
+        draw_key, update_key = jax.random.split(jax.random.fold_in(key, i))
+        batch = lesson.draw(draw_key)
+        reward = batch.reward / lesson.reward_std
+        batch = batch._replace(obs=see(batch.obs), next_obs=see(batch.next_obs), reward=reward)
+        return learner.update(update_key, carry[0], batch)
+
+    return jax.lax.fori_loop(0, num_updates, one_update, (state, metrics))
+
+
+def no_learner_metrics(learner: Learner, obs_size: int, action_size: int) -> Metrics:
+    """Zeros in the shape of the learner's metrics, to start a loop with."""
+    flag, obs = jnp.zeros(1, bool), jnp.zeros((1, obs_size))
+    batch = Transition(obs, jnp.zeros((1, action_size)), jnp.zeros(1), obs, flag, flag)
+    key = jax.random.key(0)
+    return no_metrics(lambda: learner.update(key, learner.init(key), batch)[1])
+
+
+def reward_std(data: Replay[Transition], wanted: bool) -> Array:
+    """Standard deviation of the rewards held, at least 1e-6; 1 where rewards stay as they are."""
+    if not wanted:
+        return jnp.ones(())
+    held = jnp.arange(replay.capacity(data)) < data.size
+    count = jnp.maximum(data.size, 1)
+    rewards = jnp.where(held, data.rows.reward, 0.0)
+    mean = jnp.sum(rewards) / count
+    return jnp.maximum(jnp.sqrt(jnp.sum(jnp.where(held, rewards - mean, 0.0) ** 2) / count), 1e-6)

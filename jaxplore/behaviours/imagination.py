@@ -1,0 +1,233 @@
+"""Behaviour by imagination: a learner is trained in rollouts of the belief's models (Algorithm 1, lines 7-9)."""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxplore import normalizer, replay
+from jaxplore.behaviours.base import (
+    Behaviour,
+    Experience,
+    Lesson,
+    label,
+    make_act,
+    no_learner_metrics,
+    renewed,
+    reward_std,
+    train,
+)
+from jaxplore.behaviours.rollout import Mover, World, rollout
+from jaxplore.beliefs.base import Belief
+from jaxplore.learners.base import Learner
+from jaxplore.replay import Replay
+from jaxplore.signals.base import Score
+from jaxplore.types import Array, Key, Metrics, Transition
+from jaxplore.validate import Checks
+
+
+@dataclass(frozen=True)
+class ImaginationConfig:
+    """How the policy is trained in each round. The defaults are nnaisense/max's, which the paper uses."""
+
+    num_actors: int = 128
+    """Rollouts side by side. nnaisense/max: 128."""
+    horizon: int = 50
+    """Steps of a rollout. nnaisense/max: 50."""
+    num_rollouts: int = 50
+    """Times all actors roll out, one after the other. nnaisense/max: 50."""
+    num_random_rollouts: int = 3
+    """How many of them take uniform actions and train nothing. nnaisense/max: 3."""
+    updates_per_rollout: int = 50
+    """Updates of the policy after each rollout. nnaisense/max: one per imagined step."""
+    real_updates: int = 100
+    """Updates on the real data alone, before imagining. nnaisense/max: 100."""
+    real_fraction: float = 0.0
+    """Share of each later batch that is real. 0: imagined data only (nnaisense/max); 1: real data only."""
+    current_fraction: float = 1.0
+    """Share of the actors that start where the environment stands; the others start in past states."""
+    mover: Mover = "per_step"
+    """Which model moves an actor. nnaisense/max: a random one `per_step`. Also `per_rollout`, `mean`."""
+    bound: float = 0.0
+    """Standard deviations of the real data that imagined observations and changes stay within. 0: no bound (paper)."""
+    replay_capacity: int = 320_000
+    """Imagined transitions kept. nnaisense/max makes 320,000 in a round."""
+    restart_every: int = 1
+    """Rounds that a policy and its imagined data live for. 1: new ones each round (nnaisense/max). 0: for good."""
+    normalize_reward: bool = False
+    """Whether rewards are divided by their standard deviation over the imagined data. Paper: no."""
+    act_greedily: bool = True
+    """Whether the real environment gets the policy's squashed mean (nnaisense/max) or a sample."""
+
+    def __post_init__(self) -> None:
+        checks = Checks(self)
+        for field in ("num_actors", "horizon", "num_rollouts", "updates_per_rollout", "replay_capacity"):
+            checks.at_least(field, 1)
+        for field in ("num_random_rollouts", "real_updates", "restart_every"):
+            checks.at_least(field, 0)
+        checks.in_range("bound", 0.0)
+        for field in ("real_fraction", "current_fraction"):
+            checks.in_range(field, 0.0, 1.0)
+        checks.one_of("mover", get_args(Mover))
+        if self.replay_capacity < self.num_actors * self.horizon:
+            allowed = f"at least num_actors * horizon = {self.num_actors * self.horizon}"
+            raise checks.refusal("replay_capacity", "does not hold one rollout", allowed)
+
+
+@struct.dataclass
+class ImaginationState:
+    """What a policy trained in imagination carries."""
+
+    learner: Any
+    imagined: Replay[Transition]
+    age: Array
+    """Rounds that the policy has lived through, int32."""
+
+
+class Imagination(NamedTuple):
+    """The fixed parts of the behaviour."""
+
+    belief: Belief
+    score: Score
+    learner: Learner
+    example: Transition
+    """One transition of zeros, in the environment's shapes."""
+    config: ImaginationConfig
+
+
+def make_imagination(
+    belief: Belief, score: Score, learner: Learner, obs_size: int, action_size: int, config: ImaginationConfig
+) -> Behaviour:
+    """Train a learner in rollouts imagined by the belief's models (Algorithm 1, lines 7-9).
+
+    Args:
+        belief: whose models imagine; it must predict.
+        score: the intrinsic reward.
+        learner: such as `make_sac` gives; it sees normalised observations.
+        obs_size: `O`.
+        action_size: `A`.
+        config: how much of everything.
+
+    Returns:
+        A `Behaviour`. The metrics are the learner's, from the last update, and `imagined_reward`,
+        `imagined_reward_p95` (of the last rollout, in the reward's own units) and `invalid_imagined` (share of its
+        transitions that were not finite, and dropped).
+
+    Raises:
+        ValueError: the belief does not predict.
+    """
+    if belief.predict is None:
+        raise ValueError("belief predicts nothing, so nothing can be imagined. Allowed: a belief with `predict`.")
+    flag = jnp.zeros((), bool)
+    example = Transition(jnp.zeros(obs_size), jnp.zeros(action_size), jnp.zeros(()), jnp.zeros(obs_size), flag, flag)
+    parts = Imagination(belief, score, learner, example, config)
+    return Behaviour(
+        init=functools.partial(init, parts),
+        improve=functools.partial(improve, parts),
+        actor=lambda state: learner.actor(state.learner),
+        act=make_act(learner, config.act_greedily),
+        act_greedily=make_act(learner, True),
+    )
+
+
+def init(parts: Imagination, key: Key) -> ImaginationState:
+    """A new policy and no imagined data."""
+    imagined = replay.init(parts.example, parts.config.replay_capacity)
+    return ImaginationState(parts.learner.init(key), imagined, jnp.zeros((), jnp.int32))
+
+
+def improve(
+    parts: Imagination, key: Key, state: ImaginationState, experience: Experience
+) -> tuple[ImaginationState, Metrics]:
+    """One round: updates on real data if the configuration wants some, then imagined rollouts with updates after each.
+
+    The round's models are fixed. Metrics are those of the last update and the last rollout.
+    """
+    learner, config = parts.learner, parts.config
+    init_key, real_key, rollouts_key = jax.random.split(key, 3)
+    normalizers = experience.normalizers
+    state = renewed(init_key, state, functools.partial(init, parts), config.restart_every)
+    needs_real = config.real_updates > 0 or config.real_fraction > 0
+    real = label(parts.belief, parts.score, experience) if needs_real else experience.data
+    obs_size, action_size = parts.example.obs.shape[0], parts.example.action.shape[0]
+    learner_state, metrics = state.learner, no_learner_metrics(learner, obs_size, action_size)
+    if config.real_updates > 0:
+        std = reward_std(real, config.normalize_reward)
+        lesson = Lesson(lambda draw_key: replay.sample(draw_key, real, learner.batch_size), normalizers, std)
+        learner_state, metrics = train(learner, real_key, learner_state, lesson, config.real_updates, metrics)
+
+    def one_rollout(i: Array, carry: tuple[Any, Replay[Transition], Metrics, Metrics]) -> tuple[Any, ...]:
+        learner_state, imagined, metrics, _ = carry
+        start_key, rollout_key, train_key = jax.random.split(jax.random.fold_in(rollouts_key, i), 3)
+        is_random = i < config.num_random_rollouts
+        rows = imagine(parts, (start_key, rollout_key), learner.actor(learner_state), is_random, experience)
+        finite = jnp.isfinite(rows.reward) & jnp.all(jnp.isfinite(rows.next_obs), axis=-1)
+        imagined = replay.add(imagined, rows, finite)
+        draw = mixed_draw(imagined, real, learner.batch_size, config.real_fraction)
+        lesson = Lesson(draw, normalizers, reward_std(imagined, config.normalize_reward))
+        num_updates = jnp.where(is_random, 0, config.updates_per_rollout)
+        learner_state, metrics = train(learner, train_key, learner_state, lesson, num_updates, metrics)
+        rewards = jnp.where(finite, rows.reward, jnp.nan)
+        seen = {
+            "imagined_reward": jnp.nanmean(rewards),
+            "imagined_reward_p95": jnp.nanpercentile(rewards, 95.0),
+            "invalid_imagined": jnp.mean(~finite),
+        }
+        return learner_state, imagined, metrics, seen
+
+    nothing = jnp.zeros(())
+    seen = {"imagined_reward": nothing, "imagined_reward_p95": nothing, "invalid_imagined": nothing}
+    learner_state, imagined, metrics, seen = jax.lax.fori_loop(
+        0, config.num_rollouts, one_rollout, (learner_state, state.imagined, metrics, seen)
+    )
+    return ImaginationState(learner_state, imagined, state.age + 1), {**metrics, **seen}
+
+
+def imagine(
+    parts: Imagination, keys: tuple[Key, Key], actor: Any, is_random: Array, experience: Experience
+) -> Transition:
+    """One rollout of all actors, by the policy or by uniform actions: transitions `[H * N, ...]`."""
+    config, normalizers = parts.config, experience.normalizers
+    start_key, rollout_key = keys
+
+    def act(key: Key, obs: Array) -> Array:
+        drawn = parts.learner.act(key, actor, normalizer.normalize(normalizers.obs, obs))
+        return jnp.where(is_random, jax.random.uniform(key, drawn.shape, minval=-1.0, maxval=1.0), drawn)
+
+    world = World(parts.belief, experience.models, normalizers, parts.score)
+    start = starts(start_key, experience, config.num_actors, config.current_fraction)
+    rows = rollout(rollout_key, act, world, start, config.horizon, config.mover, config.bound)
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), rows)
+
+
+def starts(key: Key, experience: Experience, num_actors: int, current_fraction: float) -> Array:
+    """Where the actors start, `[N, O]`: a share of them where the environment stands, the others in past states."""
+    num_current = round(current_fraction * num_actors)
+    past = replay.sample(key, experience.data, num_actors).obs
+    current = (jnp.arange(num_actors) < num_current)[:, None]
+    return jnp.where(current, experience.obs[None], past)
+
+
+def mixed_draw(
+    imagined: Replay[Transition], real: Replay[Transition], batch_size: int, real_fraction: float
+) -> Callable[[Key], Transition]:
+    """`draw(key) -> batch [B, ...]`, a share of it real."""
+    num_real = round(real_fraction * batch_size)
+
+    def draw(key: Key) -> Transition:
+        if num_real == 0:
+            return replay.sample(key, imagined, batch_size)
+        if num_real == batch_size:
+            return replay.sample(key, real, batch_size)
+        real_key, imagined_key = jax.random.split(key)
+        parts = (
+            replay.sample(real_key, real, num_real),
+            replay.sample(imagined_key, imagined, batch_size - num_real),
+        )
+        return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *parts)
+
+    return draw

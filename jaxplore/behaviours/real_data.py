@@ -1,0 +1,179 @@
+"""Behaviour on real transitions alone: re-labelled with an intrinsic reward, or with the task's own."""
+
+import functools
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxplore import replay
+from jaxplore.behaviours.base import (
+    Behaviour,
+    Experience,
+    Lesson,
+    label,
+    make_act,
+    no_learner_metrics,
+    renewed,
+    reward_std,
+    train,
+)
+from jaxplore.beliefs.base import Belief
+from jaxplore.learners.base import Learner
+from jaxplore.signals.base import Score
+from jaxplore.types import Array, Key, Metrics
+from jaxplore.validate import Checks
+
+
+@dataclass(frozen=True)
+class ReactiveConfig:
+    """How a policy is trained in each round by methods that seek an intrinsic reward and imagine nothing."""
+
+    updates: int = 2_450
+    """Updates in each round, on batches of all real data. The default is what nnaisense/max's policy gets in
+    imagination and on real data together; its own reactive commands make 100."""
+    restart_every: int = 1
+    """Rounds that a policy lives for. 1: a new one each round (nnaisense/max). 0: never a new one."""
+    normalize_reward: bool = False
+    """Whether rewards are divided by their standard deviation over the data. Paper: no."""
+    act_greedily: bool = True
+    """Whether the real environment gets the policy's squashed mean (nnaisense/max) or a sample."""
+
+    def __post_init__(self) -> None:
+        checks = Checks(self)
+        checks.at_least("updates", 1)
+        checks.at_least("restart_every", 0)
+
+
+@struct.dataclass
+class ReactiveState:
+    """What a policy trained on re-labelled real transitions carries."""
+
+    learner: Any
+    age: Array
+    """Rounds that the policy has lived through, int32."""
+
+
+class Reactive(NamedTuple):
+    """The fixed parts of the behaviour."""
+
+    belief: Belief
+    score: Score
+    learner: Learner
+    sizes: tuple[int, int]
+    """`O` and `A`."""
+    config: ReactiveConfig
+
+
+def make_reactive(
+    belief: Belief,
+    score: Score,
+    learner: Learner,
+    obs_size: int,
+    action_size: int,
+    config: ReactiveConfig | None = None,
+) -> Behaviour:
+    """Train a learner on real transitions alone, with the intrinsic reward that the round's models give them.
+
+    The reactive mode of nnaisense/max: novelty is looked for where the agent has been, nothing is imagined. As models
+    have just been fitted to the same transitions, an error is small where the fit is good, not only where nothing is
+    new.
+
+    Args:
+        belief: whose models label the data; it must predict.
+        score: the intrinsic reward.
+        learner: such as `make_sac` gives; it sees normalised observations.
+        obs_size: `O`.
+        action_size: `A`.
+        config: how much of everything.
+
+    Returns:
+        A `Behaviour`. The metrics are the learner's, from the last update.
+
+    Raises:
+        ValueError: the belief does not predict.
+    """
+    if belief.predict is None:
+        raise ValueError("belief predicts nothing, so nothing can be labelled. Allowed: a belief with `predict`.")
+    config = config or ReactiveConfig()
+    parts = Reactive(belief, score, learner, (obs_size, action_size), config)
+    return Behaviour(
+        init=functools.partial(init_reactive, parts),
+        improve=functools.partial(improve_reactive, parts),
+        actor=lambda state: learner.actor(state.learner),
+        act=make_act(learner, config.act_greedily),
+        act_greedily=make_act(learner, True),
+    )
+
+
+def init_reactive(parts: Reactive, key: Key) -> ReactiveState:
+    """A new policy."""
+    return ReactiveState(parts.learner.init(key), jnp.zeros((), jnp.int32))
+
+
+def improve_reactive(
+    parts: Reactive, key: Key, state: ReactiveState, experience: Experience
+) -> tuple[ReactiveState, Metrics]:
+    """One round: all real data get their reward, and the policy its updates on them."""
+    learner, config = parts.learner, parts.config
+    init_key, train_key = jax.random.split(key)
+    state = renewed(init_key, state, functools.partial(init_reactive, parts), config.restart_every)
+    real = label(parts.belief, parts.score, experience)
+    lesson = Lesson(
+        lambda draw_key: replay.sample(draw_key, real, learner.batch_size),
+        experience.normalizers,
+        reward_std(real, config.normalize_reward),
+    )
+    nothing = no_learner_metrics(learner, *parts.sizes)
+    learner_state, metrics = train(learner, train_key, state.learner, lesson, config.updates, nothing)
+    return ReactiveState(learner_state, state.age + 1), metrics
+
+
+@dataclass(frozen=True)
+class ModelFreeConfig:
+    """How a learner is trained on real transitions alone, with the environment's own reward."""
+
+    updates_per_round: int = 25
+    """Updates after each round. 25: one for each step of a round of 25."""
+    normalize_obs: bool = True
+    """Whether the learner sees observations less their mean and over their standard deviation. One-hot observations
+    always stay as they are."""
+    act_greedily: bool = False
+    """Whether the real environment gets the policy's best action or one that is drawn to explore."""
+
+    def __post_init__(self) -> None:
+        Checks(self).at_least("updates_per_round", 1)
+
+
+def make_model_free(
+    learner: Learner, obs_size: int, action_size: int, config: ModelFreeConfig | None = None
+) -> Behaviour:
+    """Train a learner on the real transitions and the environment's own reward: no belief, no intrinsic reward.
+
+    The learner lives as long as the run; each round goes on from where the last one stopped, on batches drawn from all
+    real data.
+
+    Args:
+        learner: such as `make_ddqn` or `make_sac` gives.
+        obs_size: `O`.
+        action_size: `A`.
+        config: how much of everything. `normalize_obs` is done as it says, whatever the observations are.
+
+    Returns:
+        A `Behaviour`. The metrics are the learner's, from the last update.
+    """
+    config = config or ModelFreeConfig()
+
+    def improve(key: Key, state: Any, experience: Experience) -> tuple[Any, Metrics]:
+        lesson = Lesson(
+            lambda draw_key: replay.sample(draw_key, experience.data, learner.batch_size),
+            experience.normalizers if config.normalize_obs else None,
+            jnp.ones(()),
+        )
+        nothing = no_learner_metrics(learner, obs_size, action_size)
+        return train(learner, key, state, lesson, config.updates_per_round, nothing)
+
+    act = make_act(learner, config.act_greedily, config.normalize_obs)
+    return Behaviour(learner.init, improve, learner.actor, act, make_act(learner, True, config.normalize_obs))

@@ -1,0 +1,101 @@
+"""Rollouts of a policy in sampled models: all m models, all actors, the whole horizon in one program."""
+
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+
+from jaxplore import normalizer
+from jaxplore.beliefs.base import Belief
+from jaxplore.dynamics import Normalizers
+from jaxplore.signals.base import Score
+from jaxplore.types import Array, Key, Transition
+
+Mover: TypeAlias = Literal["per_step", "per_rollout", "mean"]
+"""Which model moves an actor: a random one at each step (nnaisense/max), one for its whole rollout, or the mean."""
+
+
+class World(NamedTuple):
+    """What a policy is imagined in."""
+
+    belief: Belief
+    """Whose models predict; it must predict."""
+    models: Any
+    """As the belief samples them, with a leading axis `M`."""
+    normalizers: Normalizers
+    """Units of the models."""
+    score: Score
+    """The intrinsic reward of each imagined step."""
+
+
+def rollout(
+    key: Key,
+    act: Callable[[Key, Array], Array],
+    world: World,
+    start: Array,
+    horizon: int,
+    mover: Mover = "per_step",
+    bound: float = 0.0,
+) -> Transition:
+    """Imagine what a policy would meet.
+
+    Every model predicts every actor at every step: the reward is read off all of them, and one of them (or their
+    mean) says where the actor goes; one that states a variance is drawn from, as in nnaisense/max. Nothing terminates
+    in imagination.
+
+    Args:
+        key: consumed.
+        act: `act(key, obs [N, O]) -> action [N, A]`, on raw observations.
+        world: the belief, models drawn from it, their units and the intrinsic reward.
+        start: where each actor starts, `[N, O]`.
+        horizon: steps, `H`.
+        mover: which model moves an actor.
+        bound: imagined observations stay within this many standard deviations of the real data's mean, and changes
+            within as many of theirs: errors of a model feed on themselves. 0: no bound.
+
+    Returns:
+        Transitions `[H, N, ...]` with the intrinsic reward.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jaxplore import beliefs, dynamics, rewards
+        >>> belief = beliefs.make_generator_belief(2, 1, dynamics.DynamicsConfig(hidden=(8,)))
+        >>> models = belief.sample(jax.random.key(0), belief.init(jax.random.key(1)), 4)
+        >>> world = World(
+        ...     belief, models, dynamics.init_normalizers(2, 1),
+        ...     lambda prediction, delta, normalizers: rewards.variance(prediction))
+        >>> imagined = rollout(
+        ...     jax.random.key(2), lambda key, obs: jax.random.uniform(key, (obs.shape[0], 1)), world,
+        ...     jnp.zeros((16, 2)), horizon=5)
+        >>> imagined.next_obs.shape
+        (5, 16, 2)
+    """
+    belief, models, normalizers, score = world
+    member_key, scan_key = jax.random.split(key)
+    num_actors = start.shape[0]
+    members = jax.random.randint(member_key, (num_actors,), 0, jax.tree.leaves(models)[0].shape[0])
+
+    def step(obs: Array, step_key: Key) -> tuple[Array, Transition]:
+        act_key, mover_key = jax.random.split(step_key)
+        action = act(act_key, obs)
+        prediction = belief.imagine(models, normalizers, obs, action)
+        num_models = prediction.mean.shape[0]
+        if mover == "mean":
+            delta = jnp.mean(prediction.mean, axis=0)
+        else:
+            chosen = members if mover == "per_rollout" else jax.random.randint(mover_key, (num_actors,), 0, num_models)
+            delta = prediction.mean[chosen, jnp.arange(num_actors)]
+            if prediction.var is not None:
+                std = jnp.sqrt(prediction.var[chosen, jnp.arange(num_actors)])
+                delta = delta + std * jax.random.normal(jax.random.fold_in(mover_key, 1), delta.shape)
+        if bound:
+            delta = jnp.clip(delta, -bound, bound)
+        next_obs = belief.encoding.next_obs(normalizers, obs, delta)
+        if bound:
+            seen = normalizer.normalize(normalizers.obs, next_obs)
+            next_obs = normalizer.denormalize(normalizers.obs, jnp.clip(seen, -bound, bound))
+        never = jnp.zeros(num_actors, bool)
+        return next_obs, Transition(obs, action, score(prediction, delta, normalizers), next_obs, never, never)
+
+    return jax.lax.scan(step, start, jax.random.split(scan_key, horizon))[1]

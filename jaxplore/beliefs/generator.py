@@ -1,0 +1,210 @@
+"""A generator of networks: G(z; eta) turns Gaussian noise into the parameters of any Flax network.
+
+One small MLP per layer of the target network maps the noise z to that layer's weights and biases (section 3.1 of
+Ratzlaff et al. 2020, figure 1). The target network is given by example: any tree of parameters will do, so a
+posterior can be put over any network.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxplore.networks import MLP, apply
+from jaxplore.types import Array, Key, Params
+from jaxplore.validate import Checks
+
+Noise = Literal["shared", "per_layer"]
+InitStd = Literal["match_example", "he", "lecun"]
+
+
+@dataclass(frozen=True)
+class GeneratorConfig:
+    """Shape and initialisation of a generator."""
+
+    noise_size: int = 32
+    """Entries of z. Paper: 32."""
+    hidden: tuple[int, ...] = (64, 64)
+    """Widths of the hidden layers of each layer generator. Paper: 64, 64 (ReLU)."""
+    noise: Noise = "shared"
+    """`shared`: one z for all layers (main text and figure 1). `per_layer`: an independent z each (appendix)."""
+    init_std: InitStd = "match_example"
+    """Standard deviation of a sampled network's kernel entries at the start: that of the example's own entries, or
+    He's sqrt(2 / fan_in), or LeCun's sqrt(1 / fan_in)."""
+    constant_fraction: float = 0.5
+    """Share of that variance that does not depend on z, in [0, 1). 0: unrelated networks; near 1: nearly equal ones."""
+    bias_std: float = 0.1
+    """The same for entries of leaves with fewer than two axes (biases, scales), around the example's value."""
+
+    def __post_init__(self) -> None:
+        checks = Checks(self)
+        checks.at_least("noise_size", 1)
+        checks.widths("hidden")
+        checks.one_of("noise", get_args(Noise))
+        checks.one_of("init_std", get_args(InitStd))
+        checks.in_range("constant_fraction", 0.0, 1.0, open_high=True)
+        checks.in_range("bias_std", 0.0)
+
+
+class Generator(NamedTuple):
+    """Pure functions of one generator."""
+
+    init: Callable[[Key], Params]
+    """`init(key) -> eta`."""
+    sample_noise: Callable[[Key, int], Array]
+    """`sample_noise(key, num) -> z`: `[num, Z]`, or `[num, layers, Z]` where each layer has its own."""
+    generate: Callable[[Params, Array], Params]
+    """`generate(eta, z) -> theta`: one network's parameters from one z, shaped like the example."""
+    sample: Callable[[Params, Array], Params]
+    """`sample(eta, zs) -> thetas`: `generate` under `vmap` over z; every leaf gets a leading axis `M`."""
+
+
+class GeneratorSpec(NamedTuple):
+    """The fixed parts of a generator, which its functions take first; `make_spec` derives them from an example."""
+
+    layers: dict[str, tuple[int, ...]]
+    """Each layer's leaves, by their place in the flattened tree."""
+    shapes: tuple[tuple[int, ...], ...]
+    """Of each leaf."""
+    treedef: Any
+    """Structure of the tree that the leaves are put into."""
+    targets: tuple[tuple[np.ndarray, float], ...]
+    """Means `[size]` and standard deviation that each leaf's numbers start with."""
+    features: MLP
+    """All but the last layer of each layer generator."""
+    config: GeneratorConfig
+
+
+def fan_in(leaf: Array) -> int:
+    """Inputs that feed one output of a kernel in Flax's layout `[..., in, out]`."""
+    return math.prod(leaf.shape[:-1])
+
+
+def kernel_std(leaf: Array, rule: InitStd) -> float:
+    """Standard deviation that `rule` gives the entries of a kernel."""
+    if rule == "match_example":
+        return float(np.sqrt(np.mean(np.square(np.asarray(leaf)))))
+    return math.sqrt((2.0 if rule == "he" else 1.0) / fan_in(leaf))
+
+
+def make_spec(example: Params, config: GeneratorConfig) -> GeneratorSpec:
+    """The fixed parts of a generator of networks shaped like `example`; raises as `make_generator`."""
+    paths_and_leaves, treedef = jax.tree_util.tree_flatten_with_path(example)
+    if not paths_and_leaves:
+        raise ValueError("example has no leaves. Allowed: a tree with at least one parameter array.")
+    layers: dict[str, tuple[int, ...]] = {}
+    for index, (path, _) in enumerate(paths_and_leaves):
+        name = jax.tree_util.keystr(path[:-1], simple=True, separator="/") or "root"
+        layers[name] = (*layers.get(name, ()), index)
+    return GeneratorSpec(
+        layers=layers,
+        shapes=tuple(leaf.shape for _, leaf in paths_and_leaves),
+        treedef=treedef,
+        targets=tuple(_targets(path, leaf, config) for path, leaf in paths_and_leaves),
+        features=MLP(config.hidden[:-1], config.hidden[-1], "relu", "he", "he"),
+        config=config,
+    )
+
+
+def _targets(path: Any, leaf: Array, config: GeneratorConfig) -> tuple[np.ndarray, float]:
+    """Means `[size]` and standard deviation that a leaf's numbers start with, over networks and initialisations."""
+    if leaf.ndim < 2:
+        return np.ravel(np.asarray(leaf, np.float32)), config.bias_std
+    std = kernel_std(leaf, config.init_std)
+    if std == 0.0:
+        raise ValueError(
+            f"example{jax.tree_util.keystr(path)} is all zeros, so its spread cannot be matched. "
+            "Allowed: an initialised network, or init_std='he' or 'lecun'."
+        )
+    return np.zeros(leaf.size, np.float32), std
+
+
+def init_head(config: GeneratorConfig, key: Key, centre: np.ndarray, std: float) -> Array:
+    """What maps a layer's features to one leaf, `[size, width + 1]`: a row for each number of the leaf.
+
+    The bias is the last column, that of a feature which is always 1: its gradient is then part of one matrix product. A
+    leaf has its own so that nothing is cut up and put together again.
+
+    Args:
+        config: its last hidden width is the features'.
+        key: consumed.
+        centre: means that the leaf's numbers start with, `[size]`.
+        std: their standard deviation.
+    """
+    kernel_key, bias_key = jax.random.split(key)
+    # With He's initialisation the features entering the last layer have mean square 1, so their sum over `width`
+    # entries of variance v / width has variance v.
+    width, size = config.hidden[-1], centre.size
+    kernel_std = std * math.sqrt((1.0 - config.constant_fraction) / width)
+    kernel = kernel_std * jax.random.normal(kernel_key, (size, width))
+    constant = std * math.sqrt(config.constant_fraction) * jax.random.normal(bias_key, (size,))
+    return jnp.concatenate([kernel, (centre + constant)[:, None]], axis=1)
+
+
+def init(spec: GeneratorSpec, key: Key) -> Params:
+    """Freshly initialised eta, by layer: `features` and the head of each leaf; see `Generator.init`."""
+    eta = {}
+    for name, layer_key in zip(spec.layers, jax.random.split(key, len(spec.layers)), strict=True):
+        indices = spec.layers[name]
+        features_key, *keys = jax.random.split(layer_key, 1 + len(indices))
+        heads = {str(i): init_head(spec.config, key, *spec.targets[i]) for i, key in zip(indices, keys, strict=True)}
+        features = spec.features.init(features_key, jnp.zeros(spec.config.noise_size))["params"]
+        eta[name] = {"features": features, **heads}
+    return eta
+
+
+def sample_noise(spec: GeneratorSpec, key: Key, num: int) -> Array:
+    """Standard normal noise, `[num, Z]` or `[num, layers, Z]`; see `Generator.sample_noise`."""
+    size = spec.config.noise_size
+    shape = (num, size) if spec.config.noise == "shared" else (num, len(spec.layers), size)
+    return jax.random.normal(key, shape)
+
+
+def generate(spec: GeneratorSpec, eta: Params, z: Array) -> Params:
+    """The parameters of one network from one z, `[Z]` or `[layers, Z]`; see `Generator.generate`."""
+    generated: list[Array | None] = [None] * len(spec.shapes)
+    for number, (name, indices) in enumerate(spec.layers.items()):
+        own_z = z if spec.config.noise == "shared" else z[number]
+        inputs = jnp.append(jax.nn.relu(apply(spec.features, eta[name]["features"], own_z)), 1.0)
+        for i in indices:
+            generated[i] = (inputs @ eta[name][str(i)].T).reshape(spec.shapes[i])
+    return jax.tree.unflatten(spec.treedef, generated)
+
+
+def make_generator(example: Params, config: GeneratorConfig | None = None) -> Generator:
+    """Make a generator of networks with parameters shaped like `example`.
+
+    Args:
+        example: the parameter tree of one network, freshly initialised. Leaves that share a parent (a layer's kernel
+            and bias) come from one layer generator.
+        config: shape and initialisation; the paper's by default.
+
+    Returns:
+        A `Generator`.
+
+    Raises:
+        ValueError: `example` has no leaves, or `init_std="match_example"` and a kernel of it is all zeros.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> net = MLP(hidden=(64,), output_size=2)
+        >>> example = net.init(jax.random.key(0), jnp.zeros(3))["params"]
+        >>> generator = make_generator(example)
+        >>> eta = generator.init(jax.random.key(1))
+        >>> thetas = generator.sample(eta, generator.sample_noise(jax.random.key(2), 32))
+        >>> jax.vmap(lambda theta: net.apply({"params": theta}, jnp.ones(3)))(thetas).shape
+        (32, 2)
+    """
+    spec = make_spec(example, config or GeneratorConfig())
+    generate_one = partial(generate, spec)
+    return Generator(
+        init=partial(init, spec),
+        sample_noise=partial(sample_noise, spec),
+        generate=generate_one,
+        sample=jax.vmap(generate_one, in_axes=(None, 0)),
+    )

@@ -1,0 +1,111 @@
+"""The paper's belief: a generator of dynamics networks, trained by amortised SVGD on the replay."""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from jaxplore import dynamics, networks, replay
+from jaxplore.beliefs.base import Belief, FitConfig, make_optimizer
+from jaxplore.beliefs.generator import Generator, GeneratorConfig, make_generator
+from jaxplore.beliefs.svgd import AmortizedSVGD, SVGDConfig, SVGDState, make_amortized_svgd
+from jaxplore.dynamics import ENCODINGS, DynamicsConfig, Encoding, Normalizers, Prediction
+from jaxplore.replay import Replay
+from jaxplore.types import Array, Key, Metrics, Params, Transition
+
+
+class GeneratorBelief(NamedTuple):
+    """The fixed parts of the belief."""
+
+    generator: Generator
+    posterior: AmortizedSVGD
+    apply: Callable[[Params, Array], Array]
+    """`apply(params, inputs [N, O + A]) -> [N, O]`: one network's prediction."""
+    encoding: Encoding
+    batch_size: int
+    svgd: SVGDConfig
+
+
+def make_generator_belief(
+    obs_size: int,
+    action_size: int,
+    dynamics_config: DynamicsConfig | None = None,
+    generator_config: GeneratorConfig | None = None,
+    svgd_config: SVGDConfig | None = None,
+    fit_config: FitConfig | None = None,
+) -> Belief:
+    """The paper's belief: a generator of dynamics networks, trained by amortised SVGD.
+
+    Args:
+        obs_size: `O`.
+        action_size: `A`.
+        dynamics_config: shape of a dynamics network.
+        generator_config: shape of the generator.
+        svgd_config: how the posterior is approximated.
+        fit_config: batch size and optimiser.
+
+    Returns:
+        A `Belief` whose models are parameter trees.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> belief = make_generator_belief(3, 1, DynamicsConfig(hidden=(16,)))
+        >>> state = belief.init(jax.random.key(0))
+        >>> models = belief.sample(jax.random.key(1), state, 32)
+        >>> belief.predict(models, jnp.zeros((5, 4))).mean.shape
+        (32, 5, 3)
+    """
+    fit_config, svgd_config = fit_config or FitConfig(), svgd_config or SVGDConfig()
+    dynamics_config = dynamics_config or DynamicsConfig()
+    encoding = ENCODINGS[dynamics_config.target]
+    network = dynamics.make_network(dynamics_config, obs_size)
+    # Only the example's shapes and spread are used; a fixed key keeps the factory pure.
+    example = network.init(jax.random.key(0), jnp.zeros(obs_size + action_size))["params"]
+    generator = make_generator(example, generator_config)
+
+    apply = functools.partial(_run, network, encoding)
+    posterior = make_amortized_svgd(generator, apply, obs_size, make_optimizer(fit_config), svgd_config)
+    parts = GeneratorBelief(generator, posterior, apply, encoding, fit_config.batch_size, svgd_config)
+    return Belief(
+        init=posterior.init,
+        update=functools.partial(update, parts),
+        sample=functools.partial(sample, parts),
+        predict=functools.partial(predict, parts),
+        encoding=encoding,
+        num_models=svgd_config.num_particles,
+        fit_config=fit_config,
+    )
+
+
+def update(
+    parts: GeneratorBelief, key: Key, state: SVGDState, data: Replay[Transition], normalizers: Normalizers
+) -> tuple[SVGDState, Metrics]:
+    """One step of amortised SVGD on a minibatch of `data`."""
+    batch_key, extra_key, update_key = jax.random.split(key, 3)
+    batch = replay.sample(batch_key, data, parts.batch_size)
+    inputs = parts.encoding.inputs(normalizers, batch.obs, batch.action)
+    targets = parts.encoding.targets(normalizers, batch.obs, batch.next_obs)
+    extra_inputs = None
+    if parts.svgd.repulsion_points == "independent":
+        extra = replay.sample(extra_key, data, parts.batch_size)
+        extra_inputs = parts.encoding.inputs(normalizers, extra.obs, extra.action)
+    num_data = jnp.maximum(data.size, 1)
+    return parts.posterior.update(update_key, state, inputs, targets, num_data, extra_inputs)
+
+
+def sample(parts: GeneratorBelief, key: Key, state: SVGDState, num: int) -> Params:
+    """`num` networks, each leaf with a leading axis `M = num`; the particles themselves where their noise is fixed."""
+    if parts.svgd.redraw == "fixed" and num == parts.svgd.num_particles:
+        return parts.generator.sample(state.eta, state.z)
+    return parts.generator.sample(state.eta, parts.generator.sample_noise(key, num))
+
+
+def predict(parts: GeneratorBelief, models: Params, inputs: Array) -> Prediction:
+    """What networks say of `inputs [N, O + A]`: `[M, N, O]`."""
+    return Prediction(jax.vmap(parts.apply, in_axes=(0, None))(models, inputs))
+
+
+def _run(network: networks.MLP, encoding: Encoding, params: Params, inputs: Array) -> Array:
+    return encoding.outputs(networks.apply(network, params, inputs))

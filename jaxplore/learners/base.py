@@ -1,0 +1,38 @@
+"""The interface of a learner: pure functions that turn transitions with rewards into a policy."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from jaxplore.types import Array, Key, Metrics, Transition
+
+
+class Learner(NamedTuple):
+    """A learner as pure functions, such as `make_sac`, `make_ddqn` and `make_ddpg` build.
+
+    Example:
+        One that learns nothing and always takes the action that its parameter holds:
+
+        >>> import jax, jax.numpy as jnp
+        >>> learner = Learner(
+        ...     init=lambda key: jnp.array([0.3]),
+        ...     actor=lambda state: state,
+        ...     act=lambda key, actor, obs: actor,
+        ...     act_greedily=lambda actor, obs: actor,
+        ...     update=lambda key, state, batch: (state, {}),
+        ...     batch_size=1)
+        >>> learner.act_greedily(learner.actor(learner.init(jax.random.key(0))), jnp.zeros(2)).shape
+        (1,)
+    """
+
+    init: Callable[[Key], Any]
+    """`init(key) -> state`."""
+    actor: Callable[[Any], Any]
+    """`actor(state) -> actor`: the part of the state that acting needs."""
+    act: Callable[[Key, Any, Array], Array]
+    """`act(key, actor, obs [..., O]) -> action [..., A]`, drawn as the policy explores."""
+    act_greedily: Callable[[Any, Array], Array]
+    """`act_greedily(actor, obs [..., O]) -> action [..., A]`, the one that the policy considers best."""
+    update: Callable[[Key, Any, Transition], tuple[Any, Metrics]]
+    """`update(key, state, batch [B, ...]) -> (state, metrics)`, one gradient step of every network."""
+    batch_size: int
+    """Transitions that an update expects, `B`."""

@@ -1,0 +1,243 @@
+"""The parts that a method is made of, each from the configuration: beliefs, rewards and behaviours.
+
+Each says by `reads` which fields of the configuration it looks at, so that a setting which does nothing is refused and
+not ignored.
+"""
+
+import dataclasses
+from collections.abc import Callable, Collection
+from typing import Any
+
+from jaxplore.behaviours.base import Behaviour
+from jaxplore.behaviours.distillation import make_rnd_learner, make_rnd_ppo
+from jaxplore.behaviours.gradient import make_gradient_policy
+from jaxplore.behaviours.imagination import make_imagination
+from jaxplore.behaviours.real_data import make_model_free, make_reactive
+from jaxplore.behaviours.tree_search import make_tree_search
+from jaxplore.behaviours.uniform import make_uniform
+from jaxplore.beliefs.base import Belief, make_no_belief
+from jaxplore.beliefs.ensemble import make_ensemble_belief
+from jaxplore.beliefs.implicit import make_generator_belief
+from jaxplore.config import ExplorationConfig, Sizes
+from jaxplore.dynamics import Normalizers, Prediction
+from jaxplore.learners.base import Learner
+from jaxplore.learners.ddpg import make_ddpg
+from jaxplore.learners.ddqn import make_ddqn
+from jaxplore.learners.sac import make_sac
+from jaxplore.signals import rewards
+from jaxplore.signals.base import Reward, Score
+from jaxplore.signals.task import NO_REWARD
+from jaxplore.types import Array
+from jaxplore.validate import FieldError
+
+
+def reads(*fields: Any) -> Callable[[Any], Any]:
+    """Mark a part with the fields of `ExplorationConfig` that it reads.
+
+    Args:
+        *fields: their names; or one function of the configuration that gives them, where they depend on it.
+
+    Returns:
+        A decorator; the part then has `reads(config) -> names`.
+    """
+    names: Callable[[ExplorationConfig], Collection[str]]
+    names = fields[0] if fields and callable(fields[0]) else lambda config: set(fields)
+
+    def mark(part: Any) -> Any:
+        part.reads = names
+        return part
+
+    return mark
+
+
+@reads("dynamics", "generator", "svgd", "fit")
+def generator_belief(sizes: Sizes, config: ExplorationConfig) -> Belief:
+    """The generator of dynamics networks, trained by amortised SVGD."""
+    return make_generator_belief(sizes.obs, sizes.action, config.dynamics, config.generator, config.svgd, config.fit)
+
+
+@reads("dynamics", "ensemble", "fit")
+def static_belief(sizes: Sizes, config: ExplorationConfig) -> Belief:
+    """Networks of their own, deterministic."""
+    return _ensemble(sizes, config, gaussian=False)
+
+
+@reads("dynamics", "ensemble", "fit")
+def gaussian_belief(sizes: Sizes, config: ExplorationConfig) -> Belief:
+    """Networks of their own that state a variance; where they predict probabilities, deterministic ones."""
+    return _ensemble(sizes, config, gaussian=config.dynamics.target == "delta")
+
+
+def _ensemble(sizes: Sizes, config: ExplorationConfig, *, gaussian: bool) -> Belief:
+    return make_ensemble_belief(
+        sizes.obs,
+        sizes.action,
+        gaussian=gaussian,
+        dynamics_config=config.dynamics,
+        ensemble_config=config.ensemble,
+        fit_config=config.fit,
+    )
+
+
+@reads()
+def no_belief(sizes: Sizes, config: ExplorationConfig) -> Belief:
+    """No model of the environment."""
+    return make_no_belief()
+
+
+@reads("reward_units", "dynamics")
+def variance_reward(config: ExplorationConfig) -> Reward:
+    """Equation 1, in the units that the configuration names."""
+    if config.reward_units == "raw":
+        score = lambda prediction, delta, normalizers: rewards.variance(prediction, normalizers.delta.std)  # noqa: E731
+        return Reward(score, "raw units, squared")
+    unit = squared_unit(config)
+    return Reward(lambda prediction, delta, normalizers: rewards.variance(prediction, None), unit)
+
+
+def squared_unit(config: ExplorationConfig) -> str:
+    """The unit of squared predictions."""
+    return "probability, squared" if config.dynamics.target == "one_hot" else "normalised delta, squared"
+
+
+@reads("renyi_decay", "dynamics")
+def divergence_reward(config: ExplorationConfig) -> Reward:
+    """Jensen-Renyi divergence of what the models predict; Jensen-Shannon where that is probabilities."""
+    if config.dynamics.target == "one_hot":
+        return Reward(lambda prediction, delta, normalizers: rewards.jensen_shannon(prediction), "nats")
+    decay = config.renyi_decay
+    return Reward(lambda prediction, delta, normalizers: rewards.jensen_renyi(prediction, decay), "nats")
+
+
+@reads("error_units", "dynamics")
+def error_reward(config: ExplorationConfig) -> Reward:
+    """Squared error of the models' mean, in the units that the configuration names."""
+    in_obs_units = config.error_units == "obs" and config.dynamics.target == "delta"
+
+    def score(prediction: Prediction, delta: Array, normalizers: Normalizers) -> Array:
+        scale = normalizers.delta.std / normalizers.obs.std if in_obs_units else None
+        return rewards.prediction_error(prediction, delta, scale)
+
+    return Reward(score, "std of the observation, squared" if in_obs_units else squared_unit(config))
+
+
+@reads()
+def spread_reward(config: ExplorationConfig) -> Reward:
+    """How far apart the actors' changes are."""
+    return Reward(lambda prediction, delta, normalizers: rewards.trajectory_spread(delta), "normalised delta")
+
+
+@reads()
+def no_reward(config: ExplorationConfig) -> Reward:
+    """No intrinsic reward."""
+    return NO_REWARD
+
+
+@reads("imagination", "sac")
+def sac_in_imagination(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
+    """SAC, trained in rollouts that the belief's models imagine. Refuses discrete actions."""
+    if sizes.discrete:
+        raise FieldError(
+            "planner",
+            "sac",
+            "planner='mcts' where observations are one-hot, or a method without SAC, such as random",
+            f"acts by numbers in [-1, 1]; here an action is one of {sizes.action} choices",
+            "ExplorationConfig",
+        )
+    sac = make_sac(sizes.obs, sizes.action, config.sac)
+    return make_imagination(belief, score, sac, sizes.obs, sizes.action, config.imagination)
+
+
+@reads("reactive", "sac")
+def sac_on_real_data(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
+    """SAC on real transitions, labelled anew in each round; nothing is imagined."""
+    sac = make_sac(sizes.obs, sizes.action, config.sac)
+    return make_reactive(belief, score, sac, sizes.obs, sizes.action, config.reactive)
+
+
+@reads("mcts")
+def tree_search(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
+    """Tree search in the belief's models at each real step. Refuses all but finitely many states and actions."""
+    if not (sizes.discrete and sizes.one_hot_obs):
+        raise FieldError(
+            "planner",
+            "mcts",
+            "planner='sac' where actions are numbers",
+            "searches finitely many states and actions; here actions are numbers or observations are not one-hot",
+            "ExplorationConfig",
+        )
+    return make_tree_search(belief, score, sizes.obs, sizes.action, config.mcts)
+
+
+PLANNERS: dict[str, Any] = {
+    "sac": sac_in_imagination,
+    "mcts": tree_search,
+}
+"""`ExplorationConfig.planner` -> behaviour."""
+
+
+@reads(lambda config: {"planner"} | PLANNERS[config.planner].reads(config))
+def planned(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
+    """The behaviour that the configuration names, for methods that plan in their models."""
+    return PLANNERS[config.planner](sizes, config, belief, score)
+
+
+@reads("gradient")
+def reward_gradient(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
+    """A policy by gradient ascent on the reward, through the belief's models."""
+    return make_gradient_policy(belief, score, sizes.obs, sizes.action, config.gradient)
+
+
+@reads("rnd", "ppo")
+def distillation_with_ppo(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
+    """Random network distillation as published: PPO on the real steps of its own policy."""
+    _check_replay_keeps_a_round(config)
+    return make_rnd_ppo(sizes.obs, sizes.action, config.steps_per_round, config.warm_up_steps, config.ppo, config.rnd)
+
+
+@reads("rnd", "reactive", "sac")
+def distillation_with_sac(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
+    """Random network distillation with SAC on all real transitions, as many updates as other methods have."""
+    _check_replay_keeps_a_round(config)
+    sac = make_sac(sizes.obs, sizes.action, config.sac)
+    return make_rnd_learner(sac, sizes.obs, config.steps_per_round, config.reactive, config.rnd)
+
+
+def _check_replay_keeps_a_round(config: ExplorationConfig) -> None:
+    """What came last is told by where the replay writes, which must not come round within a round."""
+    if config.data_capacity <= config.steps_per_round:
+        allowed = f"at least steps_per_round + 1 = {config.steps_per_round + 1}"
+        problem = "holds no more than a round"
+        raise FieldError("data_capacity", config.data_capacity, allowed, problem, "ExplorationConfig")
+
+
+@reads()
+def uniform_actions(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
+    """Uniform random actions."""
+    return make_uniform(sizes.action, sizes.discrete)
+
+
+def _on_task_reward(learner: Learner, sizes: Sizes, config: ExplorationConfig) -> Behaviour:
+    """A learner on real transitions, with the environment's own reward. One-hot observations stay as they are."""
+    model_free = dataclasses.replace(
+        config.model_free, normalize_obs=config.model_free.normalize_obs and not sizes.one_hot_obs
+    )
+    return make_model_free(learner, sizes.obs, sizes.action, model_free)
+
+
+@reads("model_free", "ddqn")
+def ddqn_on_task_reward(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
+    """Double DQN on the environment's own reward."""
+    return _on_task_reward(make_ddqn(sizes.obs, sizes.action, config.ddqn), sizes, config)
+
+
+@reads("model_free", "ddpg")
+def ddpg_on_task_reward(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
+    """DDPG with adaptive parameter noise on the environment's own reward."""
+    return _on_task_reward(make_ddpg(sizes.obs, sizes.action, config.ddpg), sizes, config)
+
+
+@reads("model_free", "task_sac")
+def sac_on_task_reward(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
+    """SAC on the environment's own reward."""
+    return _on_task_reward(make_sac(sizes.obs, sizes.action, config.task_sac), sizes, config)

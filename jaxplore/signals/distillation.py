@@ -1,0 +1,163 @@
+"""Random network distillation: what a network has not learned to imitate has not been seen.
+
+Burda et al. (2019), arXiv 1810.12894, with small networks for vectors instead of theirs for pictures. A predictor
+learns to say of an observation what a fixed random network says; its error is the bonus. What is done with the bonus
+is in `jaxplore.behaviours.distillation`.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from jaxplore import normalizer
+from jaxplore.networks import ACTIVATIONS, MLP, apply
+from jaxplore.normalizer import Normalizer
+from jaxplore.types import Array, Key, Params
+from jaxplore.validate import Checks
+
+UNIT = "mean squared error of the distilled features"
+"""Of the bonus, before it is divided by a standard deviation."""
+
+
+@dataclass(frozen=True)
+class RNDConfig:
+    """Settings of random network distillation."""
+
+    hidden: tuple[int, ...] = (256, 256)
+    """Hidden widths of the target, and of the predictor's first layers; ours, in place of convolutions."""
+    features: int = 512
+    """Outputs of both networks, and width of the predictor's extra layers. Burda et al.: 512."""
+    extra_layers: int = 2
+    """Hidden layers that only the predictor has. Burda et al.: 2."""
+    activation: str = "leaky_relu"
+    """Burda et al.: leaky ReLU, and ReLU in the extra layers."""
+    lr: float = 1e-4
+    """Adam's learning rate. Burda et al.: 1e-4."""
+    obs_clip: float = 5.0
+    """Standard deviations of the real data that an observation stays within. Burda et al.: 5."""
+    discount: float = 0.99
+    """gamma of the running sum of bonuses by whose standard deviation they are divided. Burda et al.: 0.99."""
+    epochs: int = 4
+    """Times that a transition is learned from after it came. Burda et al.: 4. With PPO, `PPOConfig.epochs` counts."""
+
+    def __post_init__(self) -> None:
+        checks = Checks(self)
+        checks.widths("hidden")
+        checks.one_of("activation", ACTIVATIONS)
+        for field in ("features", "epochs"):
+            checks.at_least(field, 1)
+        checks.at_least("extra_layers", 0)
+        for field in ("lr", "obs_clip"):
+            checks.in_range(field, 0.0, open_low=True)
+        checks.in_range("discount", 0.0, 1.0)
+
+
+@struct.dataclass
+class RNDState:
+    """What distillation carries."""
+
+    target: Params
+    """Of the random network, which never changes."""
+    predictor: Params
+    opt_state: optax.OptState
+
+
+class RND(NamedTuple):
+    """Random network distillation as pure functions."""
+
+    init: Callable[[Key], RNDState]
+    """`init(key) -> state`."""
+    error: Callable[[RNDState, Array], Array]
+    """`error(state, obs [..., O]) -> [...]`: mean squared error over the features, of normalised observations."""
+    update: Callable[[RNDState, Array, Array], tuple[RNDState, Array]]
+    """`update(state, obs [B, O], weights [B]) -> (state, error)`: one gradient step on the weighted mean error."""
+
+
+def make_rnd(obs_size: int, config: RNDConfig | None = None) -> RND:
+    """Make target and predictor.
+
+    Args:
+        obs_size: `O`.
+        config: Burda et al.'s settings by default.
+
+    Returns:
+        An `RND`.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> rnd = make_rnd(3, RNDConfig(hidden=(16,), features=8))
+        >>> state = rnd.init(jax.random.key(0))
+        >>> state, error = rnd.update(state, jnp.ones((5, 3)), jnp.ones(5))
+        >>> bool(rnd.error(state, jnp.ones(3)) < error)
+        True
+    """
+    config = config or RNDConfig()
+    shape = (config.features, config.activation, "orthogonal_relu", "orthogonal_relu")
+    target = MLP(config.hidden, *shape)
+    predictor = MLP((*config.hidden, *(config.features,) * config.extra_layers), *shape)
+    optimizer = optax.adam(config.lr)
+
+    def init(key: Key) -> RNDState:
+        target_key, predictor_key = jax.random.split(key)
+        params = predictor.init(predictor_key, jnp.zeros(obs_size))["params"]
+        return RNDState(target.init(target_key, jnp.zeros(obs_size))["params"], params, optimizer.init(params))
+
+    def distance(predicting: Params, fixed: Params, obs: Array) -> Array:
+        seen = jnp.clip(obs, -config.obs_clip, config.obs_clip)
+        wanted = jax.lax.stop_gradient(apply(target, fixed, seen))
+        return jnp.mean((apply(predictor, predicting, seen) - wanted) ** 2, axis=-1)
+
+    def update(state: RNDState, obs: Array, weights: Array) -> tuple[RNDState, Array]:
+        def loss(params: Params) -> Array:
+            return jnp.sum(weights * distance(params, state.target, obs)) / jnp.maximum(jnp.sum(weights), 1.0)
+
+        error, gradient = jax.value_and_grad(loss)(state.predictor)
+        steps, opt_state = optimizer.update(gradient, state.opt_state)
+        after = RNDState(state.target, optax.apply_updates(state.predictor, steps), opt_state)
+        # Without a single row Adam is not to count a step either.
+        return jax.tree.map(lambda new, old: jnp.where(jnp.sum(weights) > 0, new, old), after, state), error
+
+    return RND(init, lambda state, obs: distance(state.predictor, state.target, obs), update)
+
+
+@struct.dataclass
+class RewardScale:
+    """The spread of the discounted sum of rewards that came so far, by which they are divided."""
+
+    running: Array
+    """The sum up to the last step, each reward discounted by its age."""
+    sums: Normalizer
+    """Of all such sums."""
+
+    @property
+    def std(self) -> Array:
+        """1 before the first reward."""
+        return self.sums.std[0]
+
+
+def init_scale() -> RewardScale:
+    """Of no rewards."""
+    return RewardScale(jnp.zeros(()), normalizer.init(1))
+
+
+def update_scale(state: RewardScale, rewards: Array, valid: Array, discount: float) -> RewardScale:
+    """Take rewards `[T]`, in the order in which they came, in where `valid [T]` is set.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> scale = update_scale(init_scale(), jnp.array([1.0, 1.0]), jnp.array([True, True]), 0.5)
+        >>> float(scale.running), float(scale.std)  # of the sums 1 and 1.5
+        (1.5, 0.25)
+    """
+
+    def step(running: Array, now: tuple[Array, Array]) -> tuple[Array, Array]:
+        running = jnp.where(now[1], discount * running + now[0], running)
+        return running, running
+
+    running, sums = jax.lax.scan(step, state.running, (rewards, valid))
+    return RewardScale(running, normalizer.update(state.sums, sums[:, None], valid.astype(jnp.float32)))

@@ -1,0 +1,140 @@
+"""Gradient ascent through models: the gradient against finite differences, and the action that it finds."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from jaxplore import beliefs, dynamics, replay, rewards
+from jaxplore.behaviours import Experience, World
+from jaxplore.behaviours.gradient import GradientPolicyConfig, imagined_return, make_gradient_policy
+from jaxplore.config import ExplorationConfig, Sizes
+from jaxplore.dynamics import Prediction
+from jaxplore.exploration import make_explorer
+from jaxplore.methods import METHODS
+from jaxplore.networks import TanhGaussianPolicy
+from jaxplore.types import Transition
+
+OBS, ACTION, BEST = 2, 1, 0.6
+
+
+@pytest.fixture
+def x64():
+    with jax.enable_x64(True):
+        yield
+
+
+def predict(models, inputs):
+    """Smooth models `[M]` that differ in a gain: the change is gain * sin(obs + 2 action)."""
+    obs, action = inputs[:, :OBS], inputs[:, OBS:]
+    return Prediction(models[:, None, None] * jnp.sin(obs + 2 * action)[None])
+
+
+def variance(prediction, delta, normalizers):
+    return rewards.variance(prediction)
+
+
+def written_out(key, models, policy, params, start, horizon):
+    """J in plain loops. The keys are the library's, so that chance is the same."""
+    member_key, scan_key = jax.random.split(key)
+    members = jax.random.randint(member_key, (len(start),), 0, len(models))
+    total, obs = 0.0, start
+    for t, step_key in enumerate(jax.random.split(scan_key, horizon)):
+        gaussian = policy.apply({"params": params}, obs)
+        act_key, _ = jax.random.split(step_key)
+        # the normal draws, from what the library draws with mean 0 and standard deviation 1
+        noise = jnp.arctanh(draw(act_key, gaussian.mean.shape))
+        action = jnp.tanh(gaussian.mean + jnp.exp(gaussian.log_std) * noise)
+        moved = models[:, None, None] * jnp.sin(obs + 2 * action)[None]
+        centre = sum(moved) / len(models)
+        total += 0.9**t * jnp.mean(sum(jnp.sum((one - centre) ** 2, axis=1) for one in moved) / len(models))
+        obs = obs + jnp.stack([moved[members[i], i] for i in range(len(start))])
+    return total
+
+
+def draw(key, shape):
+    from jaxplore.networks import GaussianParams, sample_tanh_gaussian
+
+    return sample_tanh_gaussian(key, GaussianParams(jnp.zeros(shape), jnp.zeros(shape)))[0]
+
+
+@pytest.mark.parametrize("horizon", [1, 3])
+def test_the_gradient_is_that_of_the_printed_objective(x64, horizon):
+    # against J written out, and its gradient against central differences in every direction
+    policy, models = TanhGaussianPolicy((3,), ACTION, "tanh", "lecun", (-2.0, 0.0)), jnp.array([0.5, 1.0, 1.4])
+    params = policy.init(jax.random.key(0), jnp.zeros(OBS))["params"]
+    start = jax.random.normal(jax.random.key(1), (5, OBS))
+    config = GradientPolicyConfig(horizon=horizon, discount=0.9)
+    flat, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, float), params))
+    normalizers = jax.tree.map(lambda x: x.astype(float), dynamics.init_normalizers(OBS, ACTION))
+    world = World(make_belief(predict), models, normalizers, variance)
+
+    @jax.jit
+    def expected(flat):
+        key = jax.random.key(2)
+        return imagined_return(key, policy, unravel(flat), world, start, config)[0]
+
+    want = written_out(jax.random.key(2), models, policy, unravel(flat), start, horizon)
+    assert float(expected(flat)) == pytest.approx(float(want), rel=1e-9)
+    gradient, step = jax.jit(jax.grad(expected))(flat), 1e-6
+    differences = [float(expected(flat + step * e) - expected(flat - step * e)) / (2 * step) for e in np.eye(len(flat))]
+    np.testing.assert_allclose(gradient, differences, rtol=1e-6, atol=1e-9)
+    assert np.abs(differences).max() > 1e-2
+
+
+def experience(num=64):
+    obs = jax.random.normal(jax.random.key(5), (num, OBS))
+    flags = jnp.zeros(num, bool)
+    rows = Transition(obs, jnp.zeros((num, ACTION)), jnp.zeros(num), obs, flags, flags)
+    data = replay.add(replay.init(jax.tree.map(lambda x: x[0], rows), num), rows)
+    return Experience(jnp.array([0.5, 1.5]), data, jnp.int32(num), dynamics.init_normalizers(OBS, ACTION), obs[0])
+
+
+def make_belief(predict):
+    return beliefs.make_no_belief()._replace(predict=predict)
+
+
+def bent(models, inputs):
+    """Models that disagree most where the action is BEST: their gain times 1 - (action - BEST)^2 / 3."""
+    height = 1 - (inputs[:, OBS:] - BEST) ** 2 / 3
+    return Prediction(models[:, None, None] * jnp.repeat(height, OBS, axis=1)[None])
+
+
+def test_ascent_finds_the_best_action_and_the_penalty_pulls_it_back():
+    # the reward is 2 (gain spread 0.5)^2 (1 - (a - 0.6)^2 / 3)^2, largest at 0.6; a heavy penalty holds the mean at 0
+    for penalty, want in ((0.0, BEST), (100.0, 0.0)):
+        config = GradientPolicyConfig(
+            updates=300, batch_size=32, lr=1e-2, hidden=(8,), policy_penalty=penalty, normalize_reward=penalty > 0
+        )
+        behaviour = make_gradient_policy(make_belief(bent), variance, OBS, ACTION, config)
+        seen = experience()
+        improve = jax.jit(behaviour.improve)
+        state, metrics = improve(jax.random.key(1), behaviour.init(jax.random.key(0)), seen)
+        action = behaviour.act(jax.random.key(2), behaviour.actor(state), seen.normalizers, seen.data.rows.obs)
+        np.testing.assert_allclose(action, want, atol=0.1)
+    assert float(metrics["saturation"]) < 0.1
+
+
+def test_a_policy_starts_anew_each_round_or_goes_on():
+    behaviours = {
+        restart: make_gradient_policy(
+            make_belief(bent), variance, OBS, ACTION, GradientPolicyConfig(updates=1, hidden=(4,), restart=restart)
+        )
+        for restart in (True, False)
+    }
+    seen = experience()
+    for restart, behaviour in behaviours.items():
+        starts = [behaviour.init(jax.random.key(i)) for i in (0, 1)]
+        improve = jax.jit(behaviour.improve)
+        ends = [ravel_pytree(improve(jax.random.key(2), start, seen)[0].params)[0] for start in starts]
+        assert np.array_equal(*ends) == restart
+
+
+def test_refusals():
+    with pytest.raises(ValueError, match=r"cannot be differentiated\. Allowed: .*target='delta'"):
+        make_gradient_policy(beliefs.make_no_belief(), variance, OBS, ACTION)
+    with pytest.raises(ValueError, match=r"GradientPolicyConfig\.horizon=0 .*1 or more"):
+        GradientPolicyConfig(horizon=0)
+    with pytest.raises(ValueError, match=r"method='implicit_grad' takes .*numbers.*one of 2 choices.*Allowed: "):
+        make_explorer(METHODS["implicit_grad"], Sizes(3, 2, discrete=True), ExplorationConfig())

@@ -1,0 +1,182 @@
+"""The generator of networks: spread at the start, layout of the tree, noise, gradients (paper, section 3.1)."""
+
+import math
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxplore.beliefs.generator import GeneratorConfig, make_generator
+from jaxplore.networks import MLP, count_params
+
+TARGET = MLP(hidden=(48,), output_size=3)
+
+
+def draws(config, tree=None, num_inits=128, num_networks=32):
+    """Networks of many generators, fresh from `init`: every leaf `[inits, networks, ...]`."""
+    if tree is None:
+        tree = TARGET.init(jax.random.key(0), jnp.zeros(6))["params"]
+    generator = make_generator(tree, config)
+
+    def one(key):
+        init_key, noise_key = jax.random.split(key)
+        return generator.sample(generator.init(init_key), generator.sample_noise(noise_key, num_networks))
+
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(1), num_inits)))
+
+
+def relu_correlation(rho: float) -> float:
+    """Correlation (about 0) of ReLU features of Gaussians with correlation rho (arc-cosine kernel, Cho & Saul 2009)."""
+    return (math.sqrt(1 - rho**2) + rho * (math.pi - math.acos(rho))) / math.pi
+
+
+@pytest.mark.parametrize(
+    ("rule", "constant_fraction", "want"),
+    [
+        ("match_example", 0.5, (0.01, 4.0)),
+        ("he", 0.0, (math.sqrt(2 / 20), math.sqrt(2 / 60))),
+        ("lecun", 0.5, (math.sqrt(1 / 20), math.sqrt(1 / 60))),
+    ],
+)
+def test_sampled_networks_start_with_the_spread_that_the_rule_gives(rule, constant_fraction, want):
+    # over inits and networks. Kernels: mean 0, and the std of He, LeCun or the example's root mean square; a leaf with
+    # one axis: around the example's value (a LayerNorm's scale is 1) with std bias_std
+    tree = {"dense": jnp.full((20, 30), 0.01), "conv": jnp.full((3, 20, 10), -4.0), "scale": jnp.ones(50)}
+    config = GeneratorConfig(init_std=rule, constant_fraction=constant_fraction, bias_std=0.2)
+    networks = draws(config, tree)
+    for name, std in zip(("dense", "conv"), want, strict=True):
+        assert np.std(networks[name]) == pytest.approx(std, rel=0.05)
+        assert abs(np.mean(networks[name])) < 0.05 * std
+        # The share that z moves, E[Var_z] / total: features of unrelated z are correlated by relu_correlation twice,
+        # 0.494, so that z moves 0.506 of what constant_fraction leaves it.
+        moved = (1 - constant_fraction) * (1 - relu_correlation(relu_correlation(0.0)))
+        share = np.mean(np.var(networks[name], axis=1, ddof=1)) / np.mean(networks[name] ** 2)
+        assert share == pytest.approx(moved, rel=0.05)
+    assert np.mean(networks["scale"]) == pytest.approx(1.0, abs=0.02)
+    assert np.std(networks["scale"]) == pytest.approx(0.2, rel=0.05)
+
+
+def test_networks_of_an_mlp_start_like_the_mlp():
+    # hidden layers sqrt(2 / fan_in), the last sqrt(1 / fan_in); the example's spread is itself a sample of 144 numbers
+    networks = draws(GeneratorConfig(noise="per_layer", hidden=(64,), bias_std=0.2))
+    for layer, want in {"hidden_0": math.sqrt(2 / 6), "output": math.sqrt(1 / 48)}.items():
+        assert np.std(networks[layer]["kernel"]) == pytest.approx(want, rel=0.15)
+        assert np.std(networks[layer]["bias"]) == pytest.approx(0.2, rel=0.2)
+
+
+class Nested(nn.Module):
+    """A network with an array at the root, two levels of modules, a convolution and a scalar."""
+
+    @nn.compact
+    def __call__(self, x):
+        gain = self.param("gain", nn.initializers.ones, (1,))
+        x = nn.Conv(4, (3,))(x[:, None])
+        x = MLP((5,), 2, name="inner")(x.reshape(-1))
+        return nn.LayerNorm()(x) * gain
+
+
+@pytest.fixture(scope="module")
+def nested():
+    """`(example, generator of per-layer noise, eta)` of a nested network."""
+    tree = Nested().init(jax.random.key(0), jnp.zeros(6))["params"]
+    generator = make_generator(tree, GeneratorConfig(noise_size=3, hidden=(8,), noise="per_layer"))
+    return tree, generator, jax.jit(generator.init)(jax.random.key(1))
+
+
+def test_sampled_tree_is_the_examples_tree(nested):
+    # structure, shapes and dtypes, and the network runs on it; layers: root, Conv_0, LayerNorm_0, inner/*
+    tree, generator, eta = nested
+    thetas = generator.sample(eta, generator.sample_noise(jax.random.key(2), 4))
+    assert jax.tree.map(lambda a: ((4, *a.shape), a.dtype), tree) == jax.tree.map(lambda a: (a.shape, a.dtype), thetas)
+    assert sorted(eta) == ["Conv_0", "LayerNorm_0", "inner/hidden_0", "inner/output", "root"]
+    assert sum(len(head) for p in eta.values() for name, head in p.items() if name != "features") == count_params(tree)
+    outputs = jax.vmap(lambda theta: Nested().apply({"params": theta}, jnp.ones(6)))(thetas)
+    assert outputs.shape == (4, 2)
+
+
+def test_each_layer_listens_to_its_own_noise(nested):
+    # per_layer: changing z of layer k changes the leaves of layer k and no other
+    _, generator, eta = nested
+    names = ["Conv_0", "LayerNorm_0", "root", "inner/hidden_0", "inner/output"]  # in the order of the tree's leaves
+    z = generator.sample_noise(jax.random.key(2), 1)[0]
+    assert z.shape == (5, 3)
+    base = generator.generate(eta, z)
+    for k, name in enumerate(names):
+        changed = generator.generate(eta, z.at[k].add(1.0))
+        moved = jax.tree.map(lambda a, b: bool(jnp.any(a != b)), base, changed)
+        paths = [jax.tree_util.keystr(p, simple=True, separator="/") for p, m in jax.tree.leaves_with_path(moved) if m]
+        assert paths
+        assert {path.rpartition("/")[0] or "root" for path in paths} == {name}
+
+
+@pytest.mark.parametrize(("noise", "linked"), [("shared", True), ("per_layer", False)])
+def test_layers_share_their_noise_or_not(noise, linked):
+    # by least squares: with one z for both layers a linear map of the first layer's numbers gives the second's (a
+    # generator of one hidden layer has 16 features, the first layer 40 numbers); with a z each it gives nothing
+    tree = {"a": {"kernel": jnp.ones((4, 10))}, "b": {"kernel": jnp.ones((3, 3))}}
+    generator = make_generator(tree, GeneratorConfig(noise_size=2, hidden=(16,), noise=noise))
+    eta = generator.init(jax.random.key(0))
+    eta["b"]["features"] = eta["a"]["features"]
+    thetas = generator.sample(eta, generator.sample_noise(jax.random.key(1), 2000))
+    a, b = (np.asarray(thetas[n]["kernel"]).reshape(2000, -1) for n in "ab")
+    a, b = a - a.mean(axis=0), b - b.mean(axis=0)
+    residual = b - a @ np.linalg.lstsq(a, b, rcond=1e-5)[0]
+    unexplained = np.sum(residual**2) / np.sum(b**2)
+    assert unexplained < 1e-4 if linked else unexplained > 0.95
+
+
+def test_layer_order_and_offsets():
+    # each number of theta is one row of its leaf's head, in the leaf's order: with zero kernels, the row's last entry
+    tree = {"layer": {"kernel": jnp.ones((2, 3)), "bias": jnp.zeros(3)}}
+    generator = make_generator(tree, GeneratorConfig(hidden=(4,)))
+    eta = jax.tree.map(jnp.zeros_like, generator.init(jax.random.key(0)))
+    for leaf in ("0", "1"):
+        eta["layer"][leaf] = eta["layer"][leaf].at[:, -1].set(10.0 * int(leaf) + jnp.arange(len(eta["layer"][leaf])))
+    theta = generator.generate(eta, jnp.ones(32))["layer"]
+    np.testing.assert_array_equal(theta["bias"], [0, 1, 2])
+    np.testing.assert_array_equal(theta["kernel"], [[10, 11, 12], [13, 14, 15]])
+
+
+def test_sample_is_generate_for_each_z(nested):
+    # vmap against a loop
+    _, generator, eta = nested
+    zs = generator.sample_noise(jax.random.key(2), 3)
+    thetas = generator.sample(eta, zs)
+    for i, z in enumerate(zs):
+        one = generator.generate(eta, z)
+        jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, rtol=1e-5, atol=1e-6), thetas, one)
+
+
+def test_every_parameter_of_the_generator_learns(nested):
+    # the network's output depends on every leaf of eta
+    _, generator, eta = nested
+    zs = generator.sample_noise(jax.random.key(2), 16)
+
+    def loss(eta):
+        outputs = jax.vmap(lambda theta: Nested().apply({"params": theta}, jnp.arange(6.0)))(generator.sample(eta, zs))
+        return jnp.sum(outputs * jnp.array([[1.0, 2.0]]))
+
+    gradient = jax.jit(jax.grad(loss))(eta)
+    still = [jax.tree_util.keystr(p) for p, g in jax.tree.leaves_with_path(gradient) if not jnp.any(g != 0)]
+    assert still == []
+
+
+def test_bad_input_is_refused():
+    # each message names the field, the value and what is allowed
+    with pytest.raises(ValueError, match="example has no leaves"):
+        make_generator({})
+    with pytest.raises(ValueError, match=r"example\['a'\]\['kernel'\] is all zeros.*init_std='he'"):
+        make_generator({"a": {"kernel": jnp.zeros((2, 3))}})
+    make_generator({"a": {"kernel": jnp.zeros((2, 3))}}, GeneratorConfig(init_std="he"))
+    with pytest.raises(ValueError, match=r"GeneratorConfig\.noise='per_leyer' .*Did you mean 'per_layer'"):
+        GeneratorConfig(noise="per_leyer")
+    with pytest.raises(ValueError, match=r"GeneratorConfig\.constant_fraction=1\.0 .*\[0, 1\)"):
+        GeneratorConfig(constant_fraction=1.0)
+    with pytest.raises(ValueError, match=r"GeneratorConfig\.bias_std=-0\.1"):
+        GeneratorConfig(bias_std=-0.1)
+    with pytest.raises(ValueError, match=r"GeneratorConfig\.hidden=\(\)"):
+        GeneratorConfig(hidden=())
+    with pytest.raises(ValueError, match=r"GeneratorConfig\.noise_size=0"):
+        GeneratorConfig(noise_size=0)
