@@ -3,14 +3,14 @@
 # make check           lint, format and types
 # make lock            pin the dependencies again  make lock ARGS=--upgrade
 #
-# All but `lock` first create .venv from requirements.lock if that has not been done. PYTHON names the interpreter to
-# do it with: make run PYTHON=python3.12
+# All but `lock` first create .venv from requirements.lock if it is not there yet. PYTHON names the interpreter to do it
+# with: make run PYTHON=python3.12
 
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 
-# One that was named is used or refused; otherwise the first that fits.
+# A named interpreter is used or refused; otherwise the first that fits is taken.
 ifeq ($(origin PYTHON),undefined)
 PYTHONS := python3 python3.13 python3.12 python3.11
 else
@@ -29,7 +29,7 @@ run: $(INSTALLED)
 test: $(INSTALLED)
 	@$(BIN)/python -m pytest $(ARGS)
 
-# The node that comes with pyright from PyPI, and no question to PyPI whether there is a newer pyright.
+# Use the node that comes with pyright from PyPI, and do not ask PyPI for a newer pyright.
 check: $(INSTALLED)
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .

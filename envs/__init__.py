@@ -19,6 +19,7 @@ from envs.hand_block import make_hand_block
 from envs.mountain_car import make_mountain_car
 from envs.nchain import make_nchain
 from jaxplore import validate
+from jaxplore.validate import FieldError
 
 FACTORIES: dict[str, Callable[..., Environment]] = {
     "acrobot": make_acrobot,
@@ -81,6 +82,21 @@ def make(name: str, **options: Any) -> Environment:
     return factory(**options)
 
 
+def backends(name: str) -> tuple[str, ...]:
+    """The backends that `make(name, backend=...)` offers beside `"auto"`, as it says when it is asked for another.
+
+    Example:
+        >>> backends("ant_maze"), backends("nchain")
+        (('mjx', 'mujoco'), ('jax',))
+    """
+    try:
+        return (make(name, backend="?").backend,)
+    except FieldError as error:
+        if error.field != "backend":
+            raise
+        return tuple(backend for backend in error.allowed.split(", ") if backend != "auto")
+
+
 to_gymnasium.register(FACTORIES)
 
 __all__ = [
@@ -91,6 +107,7 @@ __all__ = [
     "EnvState",
     "Environment",
     "FloorPlan",
+    "backends",
     "check_name",
     "find_factory",
     "make",

@@ -132,6 +132,10 @@ def _collect_side_by_side(
     return states, rows, finite & (np.arange(capacity) < num_steps)
 
 
+def _stack_obs(states: tuple[EnvState, ...]) -> np.ndarray:
+    return np.stack([state.obs for state in states])
+
+
 def reset_all(env: Environment, keys: Key) -> tuple[EnvState, ...]:
     """`env.reset` of each key in `keys` `[S]`, of an environment on the host."""
     return env.reset_all(keys) if env.reset_all else tuple(env.reset(key) for key in keys)

@@ -20,9 +20,9 @@ from experiments.runs.config import RunConfig, differences, flag, path_of, repla
 from experiments.runs.directory import RunDirectory, Status
 from experiments.runs.errors import RunError
 from experiments.runs.presets import preset_config
-from experiments.runs.spec import RunSpec, from_json
+from experiments.runs.spec import RunRef, RunSpec, from_json
 from experiments.runs.upgrades import MOVED
-from experiments.training import build, loop
+from experiments.training import build, loop, parent
 from jaxplore.exploration import Explorer
 from jaxplore.methods import METHODS
 from jaxplore.networks import ACTIVATIONS, INITIALIZERS
@@ -42,6 +42,9 @@ class CommandLine:
     """Continue the run in --out from its latest checkpoint."""
     config: str | None = None
     """A config.json to start from, as every run saves it; other flags come on top."""
+    parent: str | None = None
+    """Start from the policy of another run: DIRECTORY or DIRECTORY@STEP (by default its latest checkpoint). Its
+    observation statistics come with it; critics are new and there are no data. For methods on the task's reward."""
     version: bool = False
     """Print the versions of everything that results depend on, and stop."""
 
@@ -77,19 +80,20 @@ def parse(argv: Sequence[str]) -> tuple[CommandLine, RunSpec]:
     )
     description = (
         "Explore an environment by a belief's own uncertainty, and draw what was seen.\n\n"
-        "The defaults below are those of the preset; --preset=paper --help shows the paper's. Of the methods' settings "
-        f"those come first that {start.config.method} reads; a flag that the chosen method does not read is refused."
+        "The defaults below are those of the preset; --preset=paper --help shows the paper's.\n"
+        f"Settings that {start.config.method} reads come first; one that the chosen method does not read is refused."
     )
     command, changes = flags.parse(
         argv, (CommandLine(), start.config), prog=PROGRAM, description=description, layout=layout
     )
-    command = {name: value or None if name in ("out", "config") else value for name, value in command.items()}
+    command = {name: value or None if name in ("out", "config", "parent") else value for name, value in command.items()}
     try:
+        ref = RunRef.parse(command["parent"]) if command["parent"] else start.parent
         config: RunConfig = replace(start.config, changes)
         check_read(argv, config)
     except FieldError as error:
         raise ValueError(error.spell(flag(error.field))) from error
-    return CommandLine(**command), dataclasses.replace(start, config=config)
+    return CommandLine(**command), RunSpec(config, ref)
 
 
 def _start(argv: Sequence[str]) -> RunSpec:
@@ -174,7 +178,15 @@ def choose_directory(command: CommandLine, spec: RunSpec) -> RunDirectory:
         if not out.holds_only_scraps():
             raise RunError(f"--out={out} holds no run (no config.json). Give the directory of a run.")
         return out
+    if status is Status.DIVERGED:
+        raise RunError(
+            f"--out={out} diverged: every seed came out with numbers that are not finite, and --resume would repeat "
+            "that to the bit. Start a run with other settings in another --out."
+        )
     changed = differences(out.config(), config)
+    was = out.spec().parent
+    if was != spec.parent:
+        changed.append(f"parent: {was} -> {spec.parent}")
     if changed:
         raise ValueError(
             f"--resume: the configuration disagrees with the one saved in {out} in {'; '.join(changed)}. "
@@ -193,7 +205,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if command.version:
             print("\n".join(f"{name} {version}" for name, version in runtime.versions().items()))
             return 0
-        env, agent, spec = prepare(spec)
+        env, agent, spec = prepare(spec, resume=command.resume)
         directory = choose_directory(command, spec)
     except (ValueError, RunError) as error:
         print(f"error: {error}", file=sys.stderr)
@@ -209,8 +221,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
 
 
-def prepare(spec: RunSpec) -> tuple[Environment, Explorer, RunSpec]:
+def prepare(spec: RunSpec, *, resume: bool) -> tuple[Environment, Explorer, RunSpec]:
     """Environment and agent, which refuse what they cannot do when they are built: before anything is written.
+
+    A run that is resumed has its parent's policy in its checkpoints.
 
     Returns:
         Them, and the specification with the physics engine that was chosen, so that another machine takes the same.
@@ -221,10 +235,14 @@ def prepare(spec: RunSpec) -> tuple[Environment, Explorer, RunSpec]:
     try:
         env = build.make_env(spec.config)
         spec = dataclasses.replace(spec, config=dataclasses.replace(spec.config, backend=env.backend))
-        return env, build.make_agent(spec.config, env), spec
+        agent = build.make_agent(spec.config, env)
+        if spec.parent is not None and not resume:
+            spec = dataclasses.replace(spec, parent=parent.resolve(spec.parent, env, agent))
+        return env, agent, spec
     except FieldError as error:
         path = path_of(spec.config, error)
-        raise ValueError(error.spell(flag(path)) if error.owner and path != error.field else str(error)) from error
+        known = path != error.field or error.field == "parent"
+        raise ValueError(error.spell(flag(path)) if known else str(error)) from error
 
 
 def carry_out(spec: RunSpec, directory: RunDirectory, env: Environment, agent: Explorer, *, resume: bool) -> int:

@@ -77,6 +77,10 @@ class Explorer(NamedTuple):
     probability) and their `divergence` (Jensen-Renyi, of probabilities Jensen-Shannon, in nats); of each the mean, and
     with `_p95` the 95th percentile. And `model_error`, the mean squared error of the models' mean, per normalised-delta
     entry, where 1 is as good as predicting the mean change; or per probability."""
+    adopt: Callable[[ExplorerState, Actor], ExplorerState] | None
+    """`adopt(state, actor) -> state`: with the policy of another agent's actor and the statistics that it sees
+    observations by; what is learned with it, such as critics, is new, and there are no data. None: the method has no
+    policy that could be taken over."""
     reward_unit: str | None
     """Of the intrinsic reward, for labels. None: the method has no intrinsic reward."""
 
@@ -125,6 +129,7 @@ def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Ex
         observe=observe,
         improve=functools.partial(improve, agent),
         assess=functools.partial(assess, agent),
+        adopt=functools.partial(adopt, agent) if behaviour.adopt else None,
         reward_unit=reward.unit if belief.predict else behaviour.bonus.unit if behaviour.bonus else None,
     )
 
@@ -158,6 +163,13 @@ def init(agent: Agent, key: Key) -> ExplorerState:
 def actor(agent: Agent, state: ExplorerState, uniform: bool | Array = False) -> Actor:
     """What acting needs of a state."""
     return Actor(agent.behaviour.actor(state.behaviour), state.normalizers, jnp.asarray(uniform))
+
+
+def adopt(agent: Agent, state: ExplorerState, actor: Actor) -> ExplorerState:
+    """The state with another agent's policy and normalisers."""
+    assert agent.behaviour.adopt is not None
+    behaviour = agent.behaviour.adopt(state.behaviour, actor.behaviour)
+    return dataclasses.replace(state, behaviour=behaviour, normalizers=actor.normalizers)
 
 
 def act(agent: Agent, key: Key, actor: Actor, obs: Array) -> Array:

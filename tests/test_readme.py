@@ -1,5 +1,7 @@
-"""The README's code runs, and its map of the folders is the tree's."""
+"""The README is a manual: its code runs, its tables are complete, its map is the tree, its links lead somewhere."""
 
+import importlib.util
+import inspect
 import json
 import re
 from pathlib import Path
@@ -13,14 +15,31 @@ import jaxplore
 from jaxplore.methods import METHODS
 
 ROOT = Path(__file__).parent.parent
-FOLDERS = ("jaxplore", "envs", "experiments")
+PACKAGES = ("jaxplore", "envs", "experiments", "benchmarks")
 README = (ROOT / "README.md").read_text()
+PAGES = ("README.md", "experiments/results/README.md", "benchmarks/README.md")
 
 
 def example(word: str) -> str:
     """The README's one Python example with `word` in it."""
     (code,) = [code for code in re.findall(r"```python\n(.*?)```", README, re.DOTALL) if word in code]
     return code
+
+
+def section(title: str) -> str:
+    """The README's section of this title, without it."""
+    (text,) = re.findall(rf"\n## {title}\n(.*?)(?=\n## |\Z)", README, re.DOTALL)
+    return text
+
+
+def first_column(text: str) -> list[str]:
+    """The names in backticks in the first column of a section's tables."""
+    rows = [row.split("|")[1] for row in text.splitlines() if row.startswith("| `")]
+    return re.findall(r"`([^`]+)`", " ".join(rows))
+
+
+def test_it_is_short():
+    assert len(README.splitlines()) <= 200
 
 
 def test_an_environment_of_your_own_takes_30_lines_and_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -44,15 +63,20 @@ def test_a_method_of_your_own_takes_25_lines_and_runs(tmp_path: Path, monkeypatc
     exec(code, {})
     (run,) = (tmp_path / "runs").iterdir()
     assert json.loads((run / "config.json").read_text())["method"] == "furthest"
+    assert json.loads((run / "scene.json").read_text())["reward_unit"] == "normalised delta, squared"
     lines = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
     assert lines[-1]["step"] == 600
     assert lines[-1]["policy/imagined_reward"] > 0
 
 
 def test_every_method_is_in_the_table():
-    (section,) = re.findall(r"\n## Methods\n(.*?)\n## ", README, re.DOTALL)
-    named = re.findall(r"`(\w+)`", "".join(row.split("|")[1] for row in section.splitlines() if row.startswith("| `")))
-    assert sorted(named) == sorted(METHODS)
+    assert sorted(first_column(section("Methods"))) == sorted(METHODS)
+
+
+def test_every_environment_is_in_the_table():
+    names = first_column(section("Environments"))
+    assert sorted(name for name in names if ":" not in name) == sorted(envs.FACTORIES)
+    assert sorted(name.partition(":")[0] for name in names if ":" in name) == sorted(envs.ADAPTERS)
 
 
 def test_the_python_example_runs_and_its_networks_fit_the_data():
@@ -72,17 +96,75 @@ def take(tree, i):
     return {layer: {name: jnp.asarray(leaf)[i] for name, leaf in leaves.items()} for layer, leaves in tree.items()}
 
 
-def test_the_map_names_every_module():
-    (tree,) = re.findall(r"## Where things are\n\n```\n(.*?)```", README, re.DOTALL)
-    for folder in FOLDERS:
-        for module in (ROOT / folder).glob("*.py"):
-            if module.name != "__init__.py":
-                assert module.name in tree, f"{folder}/{module.name} is not on the map"
-    for name in re.findall(r"\w+\.py", tree):
-        assert any((ROOT / folder / name).exists() for folder in FOLDERS), name
+def mapped() -> tuple[set[str], set[str]]:
+    """The folders on the map, and the modules on it, as paths.
+
+    A line at the margin is of a top folder, an indented one of a folder in it or, where it starts with a file, of the
+    top folder's own files; a line indented further goes on with the folder above it.
+    """
+    (tree,) = re.findall(r"```\n(.*?)```", section("Where things are"), re.DOTALL)
+    folders, modules, top, folder = set(), set(), "", ""
+    for line in tree.splitlines():
+        indent, word = len(line) - len(line.lstrip()), line.split()[0]
+        if indent == 0:
+            top = folder = word
+        elif indent == 2:
+            folder = top + word if word.endswith("/") else top
+        folders.add(folder)
+        modules |= {folder + name for name in re.findall(r"\w+\.py", line)}
+    return folders, modules
+
+
+def test_the_map_is_the_tree():
+    folders, modules = mapped()
+    assert [folder for folder in folders if not (ROOT / folder).is_dir()] == []
+    tree = {path.relative_to(ROOT).as_posix() for package in PACKAGES for path in (ROOT / package).rglob("*.py")}
+    tree = {path for path in tree if not path.endswith("__init__.py")}
+    # "One environment a file" stands for these.
+    assert "one environment a file" in README
+    environments = {Path(inspect.getfile(make)).relative_to(ROOT).as_posix() for make in envs.FACTORIES.values()}
+    assert sorted(tree - environments - modules) == [], "not on the map"
+    assert sorted(modules - tree) == [], "on the map, and not there"
+    packages = {f"{Path(path).parent.as_posix()}/" for path in tree}
+    assert sorted(packages - folders) == [], "not on the map"
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_what_a_page_points_to_exists(page: str):
+    path = ROOT / page
+    text = path.read_text()
+    links = [link for link in re.findall(r"\]\(([^)\s]+)\)", text) if not re.match(r"\w+:", link)]
+    titles = {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in re.findall(r"^#+ (.*)$", text, re.M)}
+    for link in links:
+        file, _, title = link.partition("#")
+        assert (path.parent / file).exists(), link
+        assert file or title in titles, link
+    for file in re.findall(rf"`((?:{'|'.join(PACKAGES)})/[\w./-]*)`", text):
+        assert (ROOT / file).exists(), file
+    for module in re.findall(r"python -m\s+(\w+(?:\.\w+)*)", text):
+        assert importlib.util.find_spec(module), module
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_a_page_names_only_flags_that_there_are(page: str):
+    for group, field in re.findall(r"--([a-z]+)\.([a-z-]+)", (ROOT / page).read_text()):
+        config = getattr(jaxplore.ExplorationConfig(), group)
+        assert hasattr(config, field.replace("-", "_")), f"--{group}.{field}"
 
 
 def test_public_names_exist():
     assert sorted(set(jaxplore.__all__)) == sorted(jaxplore.__all__)
     for name in jaxplore.__all__:
         assert hasattr(jaxplore, name)
+
+
+def test_the_library_table_names_only_public_names():
+    names = [name for name in first_column(section("As a library")) if re.fullmatch(r"\w+", name)]
+    assert len(names) >= 10
+    assert [name for name in names if name not in jaxplore.__all__] == []
+
+
+def test_every_command_is_in_the_table():
+    files = [path for path in (ROOT / "experiments").glob("*.py") if "__main__" in path.read_text()]
+    commands = {path.stem for path in files} - {"posterior"}  # an old name
+    assert sorted(commands - {name.split()[0] for name in first_column(section("Running"))}) == []

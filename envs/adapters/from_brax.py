@@ -14,6 +14,7 @@ from typing import Any
 from envs.adapters import brax_like
 from envs.base import Environment
 from jaxplore import validate
+from jaxplore.validate import FieldError
 
 BACKENDS = ("generalized", "mjx", "positional", "spring")
 """Brax's engines."""
@@ -31,17 +32,18 @@ def quiet() -> Iterator[None]:
 
 @functools.cache
 def load() -> ModuleType:
-    """The module `brax.envs`. Raises `ValueError` where it is missing."""
+    """The module `brax.envs`. Raises `FieldError` where it is missing."""
     try:
         with quiet():
             import brax.envs
     except ImportError as error:
-        raise ValueError(f"env='brax:...' needs the package brax ({error}). Install it: pip install brax.") from error
+        problem = f"needs the package brax ({error}). Install it: pip install brax."
+        raise FieldError("env", "brax:...", "packages that are installed", problem) from error
     return brax.envs
 
 
 def check_name(name: str) -> None:
-    """Raise `ValueError` unless Brax has an environment of this name, and is there."""
+    """Raise `FieldError` unless Brax has an environment of this name, and is there."""
     validate.one_of("env", f"brax:{name}", (f"brax:{known}" for known in load()._envs))
 
 
@@ -57,7 +59,7 @@ def make_environment(
         episode_steps: steps after which an episode is truncated.
 
     Raises:
-        ValueError: an unknown name or backend, observations that are not one vector, or a bad number.
+        FieldError: an unknown name or backend, observations that are not one vector, or a bad number.
     """
     check_name(name)
     validate.one_of("backend", backend, ("auto", *BACKENDS))

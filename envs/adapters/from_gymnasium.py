@@ -2,7 +2,7 @@
 
 A live Gymnasium environment cannot be saved. So a state is what leads to it: the seed of the episode's reset, drawn
 from the key, and the actions since. The live environments are a cache: one that is not where a state says is reset with
-the state's seed and given its actions again. A run that is resumed thus goes on to the bit, provided that the
+the state's seed and given its actions again. A run that is resumed thus continues to the bit, provided that the
 environment depends on its seed and its actions alone; one that does not is found out and refused then.
 
 - Observations: a Box of one axis; a Dict of such, one after the other in its own order; or Discrete, which becomes
@@ -16,10 +16,11 @@ environment depends on its seed and its actions alone; one that does not is foun
 # pyright: reportArgumentType=false, reportReturnType=false, reportAttributeAccessIssue=false
 # NumPy arrays stand where the contract says Array, and mujoco ships no stubs.
 
+import functools
 import importlib
 import numbers
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import jax
@@ -33,6 +34,7 @@ from envs.base import Environment, EnvSpec, EnvState, View, check_noise
 from envs.coverage import make_generic_coverage
 from jaxplore import validate
 from jaxplore.types import Key, Transition
+from jaxplore.validate import FieldError
 
 BACKEND = "gymnasium"
 EPISODE_STEPS = 1_000
@@ -52,14 +54,23 @@ class Past:
 
 
 def check_name(name: str) -> None:
-    """Raise `ValueError` unless `name` is an id in Gymnasium's registry, or `module:id`, to import first."""
+    """Raise `FieldError` unless `name` is an id in Gymnasium's registry, or `module:id`, to import first."""
     module, colon, env_id = name.rpartition(":")
     if colon:
         try:
             importlib.import_module(module)
         except ImportError as error:
-            raise ValueError(f"env='gymnasium:{name}': cannot import {module!r} ({error}). Install it.") from error
+            problem = f"cannot be made here: cannot import {module!r} ({error}). Install it."
+            raise FieldError("env", f"gymnasium:{name}", "modules that can be imported", problem) from error
     validate.one_of("env", f"gymnasium:{env_id}", (f"gymnasium:{known}" for known in registry))
+
+
+class Adapted(NamedTuple):
+    """The fixed parts of an adapted environment."""
+
+    spec: EnvSpec
+    live: "Live"
+    obs_noise: float
 
 
 def make_environment(
@@ -76,7 +87,7 @@ def make_environment(
         episode_steps: steps after which an episode is truncated; by default the registered number, or 1,000.
 
     Raises:
-        ValueError: no such environment, one that cannot be made here, or one whose observations or actions are of a
+        FieldError: no such environment, one that cannot be made here, or one whose observations or actions are of a
             kind that is not supported.
     """
     check_name(name)
@@ -84,94 +95,105 @@ def make_environment(
     obs_noise = check_noise(obs_noise)
     env_id = name.rpartition(":")[2]
     probe = _make(env_id)
-    limit = registry[env_id].max_episode_steps
-    limit = episode_steps if episode_steps is not None else limit if limit and limit > 0 else EPISODE_STEPS
-    validate.at_least("episode_steps", limit, 1)
-    obs_names, obs_limits = _observations(env_id, probe.observation_space)
-    action_names = _actions(env_id, probe.action_space)
-    spec = EnvSpec(
-        name=f"gymnasium:{name}",
-        obs_names=obs_names,
-        action_names=action_names,
-        episode_steps=limit,
-        dt=_seconds(probe),
-        discrete=isinstance(probe.action_space, spaces.Discrete),
-        one_hot_obs=isinstance(probe.observation_space, spaces.Discrete),
-        has_reward=True,
-        obs_limits=obs_limits,
-    )
+    spec = _make_spec(name, probe, episode_steps)
     live = Live(env_id, probe.observation_space, probe.action_space)
-
-    @jax.jit
-    def start(keys: Key) -> tuple[Any, Key]:
-        def one(key: Key) -> tuple[Any, Key]:
-            start_key, key = jax.random.split(key)
-            return jax.random.bits(start_key, (), "uint32") >> 1, key
-
-        return jax.vmap(one)(keys)
-
-    @jax.jit
-    def draw(keys: Key) -> tuple[Key, Any]:
-        def one(key: Key) -> tuple[Key, Any]:
-            key, noise_key = jax.random.split(key)
-            return key, obs_noise * jax.random.normal(noise_key, (spec.obs_size,), "float32")
-
-        return jax.vmap(one)(keys)
-
-    def noisy(keys: list[Key], obs: list[np.ndarray]) -> tuple[list[Key], list[np.ndarray]]:
-        if obs_noise == 0:
-            return keys, obs
-        after, noise = draw(jax.numpy.stack(keys))
-        return list(after), [clean + extra for clean, extra in zip(obs, jax.device_get(noise), strict=True)]
-
-    def reset_all(keys: Key) -> tuple[EnvState, ...]:
-        seeds, after = start(keys)
-        blank = np.zeros((limit, spec.action_size), np.float32)
-        pasts = [Past(seed, blank, live.start(int(seed))) for seed in jax.device_get(seeds)]
-        own, obs = noisy(list(after), [past.obs for past in pasts])
-        return tuple(EnvState(past, seen, np.int32(0), key) for past, seen, key in zip(pasts, obs, own, strict=True))
-
-    def step_all(states: tuple[EnvState, ...], actions: np.ndarray) -> tuple[tuple[EnvState, ...], Transition]:
-        # Not asarray: on an array still being computed NumPy waits with Python's lock held, and can hang.
-        actions = np.asarray(jax.device_get(actions), np.float32)
-        if actions.shape != (len(states), spec.action_size):
-            raise ValueError(f"action has shape {actions.shape[1:]}. Allowed: {(spec.action_size,)}.")
-        if not np.isfinite(actions).all():
-            raise ValueError(f"action is {actions}. Allowed: finite numbers.")
-        actions = np.eye(spec.action_size, dtype=np.float32)[actions.argmax(-1)] if spec.discrete else actions
-        actions = np.clip(actions, -1.0, 1.0)
-        counts = [int(state.num_steps) for state in states]
-        pasts, rewards, terminated, truncated = live.step([state.physics for state in states], counts, actions)
-        keys, obs = noisy([state.key for state in states], [past.obs for past in pasts])
-        after = tuple(
-            EnvState(past, seen, np.int32(count + 1), key)
-            for past, seen, count, key in zip(pasts, obs, counts, keys, strict=True)
-        )
-        broken = [not np.isfinite(past.obs).all() for past in pasts]
-        transitions = Transition(
-            obs=np.stack([state.obs for state in states]),
-            action=actions,
-            reward=rewards.astype(np.float32),
-            next_obs=np.stack(obs),
-            terminated=terminated | np.array(broken),
-            truncated=truncated | (np.array(counts) + 1 >= limit),
-        )
-        return after, transitions
-
-    def reset(key: Key) -> EnvState:
-        return reset_all(key[None])[0]
-
-    def step(state: EnvState, action: Any) -> tuple[EnvState, Transition]:
-        action = np.asarray(jax.device_get(action), np.float32)
-        states, transitions = step_all((state,), action[None])
-        return states[0], jax.tree.map(lambda leaf: leaf[0], transitions)
-
+    adapted = Adapted(spec, live, obs_noise)
     view = None
     if "rgb_array" in (probe.metadata.get("render_modes") or ()):
         view = _make_view(live, hasattr(probe.unwrapped, "mujoco_renderer"))
     coverage = make_generic_coverage(spec)
     probe.close()
-    return Environment(spec, reset, step, coverage, BACKEND, False, view=view, reset_all=reset_all, step_all=step_all)
+    return Environment(
+        spec,
+        functools.partial(reset, adapted),
+        functools.partial(step, adapted),
+        coverage,
+        BACKEND,
+        False,
+        view=view,
+        reset_all=functools.partial(reset_all, adapted),
+        step_all=functools.partial(step_all, adapted),
+    )
+
+
+def reset_all(adapted: Adapted, keys: Key) -> tuple[EnvState, ...]:
+    """A new episode for each of `keys` `[S]`."""
+    seeds, after = _draw_seeds(keys)
+    blank = np.zeros((adapted.spec.episode_steps, adapted.spec.action_size), np.float32)
+    pasts = [Past(seed, blank, adapted.live.start(int(seed))) for seed in jax.device_get(seeds)]
+    own, obs = _noisy(adapted, list(after), [past.obs for past in pasts])
+    return tuple(EnvState(past, seen, np.int32(0), key) for past, seen, key in zip(pasts, obs, own, strict=True))
+
+
+def step_all(
+    adapted: Adapted, states: tuple[EnvState, ...], actions: np.ndarray
+) -> tuple[tuple[EnvState, ...], Transition]:
+    """A step of each of `states` `[S]` with its row of `actions` `[S, A]`."""
+    spec = adapted.spec
+    # Not asarray: on an array still being computed NumPy waits with Python's lock held, and can hang.
+    actions = np.asarray(jax.device_get(actions), np.float32)
+    if actions.shape != (len(states), spec.action_size):
+        raise ValueError(f"action has shape {actions.shape[1:]}. Allowed: {(spec.action_size,)}.")
+    if not np.isfinite(actions).all():
+        raise ValueError(f"action is {actions}. Allowed: finite numbers.")
+    actions = np.eye(spec.action_size, dtype=np.float32)[actions.argmax(-1)] if spec.discrete else actions
+    actions = np.clip(actions, -1.0, 1.0)
+    counts = [int(state.num_steps) for state in states]
+    pasts, rewards, terminated, truncated = adapted.live.step([state.physics for state in states], counts, actions)
+    keys, obs = _noisy(adapted, [state.key for state in states], [past.obs for past in pasts])
+    after = tuple(
+        EnvState(past, seen, np.int32(count + 1), key)
+        for past, seen, count, key in zip(pasts, obs, counts, keys, strict=True)
+    )
+    broken = [not np.isfinite(past.obs).all() for past in pasts]
+    transitions = Transition(
+        obs=np.stack([state.obs for state in states]),
+        action=actions,
+        reward=rewards.astype(np.float32),
+        next_obs=np.stack(obs),
+        terminated=terminated | np.array(broken),
+        truncated=truncated | (np.array(counts) + 1 >= spec.episode_steps),
+    )
+    return after, transitions
+
+
+def reset(adapted: Adapted, key: Key) -> EnvState:
+    """A new episode."""
+    return reset_all(adapted, key[None])[0]
+
+
+def step(adapted: Adapted, state: EnvState, action: Any) -> tuple[EnvState, Transition]:
+    """A step; see `Environment.step`."""
+    action = np.asarray(jax.device_get(action), np.float32)
+    states, transitions = step_all(adapted, (state,), action[None])
+    return states[0], jax.tree.map(lambda leaf: leaf[0], transitions)
+
+
+@jax.jit
+def _draw_seeds(keys: Key) -> tuple[Any, Key]:
+    """A seed for each reset, uint32 `[S]`, and keys `[S]` to continue with."""
+
+    def one(key: Key) -> tuple[Any, Key]:
+        start_key, key = jax.random.split(key)
+        return jax.random.bits(start_key, (), "uint32") >> 1, key
+
+    return jax.vmap(one)(keys)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _draw_noise(obs_noise: float, obs_size: int, keys: Key) -> tuple[Key, Any]:
+    def one(key: Key) -> tuple[Key, Any]:
+        key, noise_key = jax.random.split(key)
+        return key, obs_noise * jax.random.normal(noise_key, (obs_size,), "float32")
+
+    return jax.vmap(one)(keys)
+
+
+def _noisy(adapted: Adapted, keys: list[Key], obs: list[np.ndarray]) -> tuple[list[Key], list[np.ndarray]]:
+    if adapted.obs_noise == 0:
+        return keys, obs
+    after, noise = _draw_noise(adapted.obs_noise, adapted.spec.obs_size, jax.numpy.stack(keys))
+    return list(after), [clean + extra for clean, extra in zip(obs, jax.device_get(noise), strict=True)]
 
 
 class Live:
@@ -221,7 +243,7 @@ class Live:
             # Steps beyond the time limit are nobody's business, but an array has an end.
             done[min(count, len(done) - 1)] = actions[i]
             after.append(Past(past.seed, done, _flat(self._obs_space, _own(obs, i))))
-            # One that has ended is not stepped on; whoever wants to is led there anew.
+            # One that has ended is not stepped on; anyone who wants to is led there again.
             at[i] = None if terminated[i] or truncated[i] else (after[i], count + 1)
         return after, rewards, terminated, truncated
 
@@ -244,10 +266,11 @@ class Live:
 
     def _check(self, obs: np.ndarray, past: Past) -> None:
         if not np.array_equal(obs, past.obs, equal_nan=True):
-            raise ValueError(
-                f"env='gymnasium:{self._id}' went elsewhere from the same seed under the same actions, so a saved "
-                "state cannot be gone on from. Allowed: environments that depend on their seed and actions alone."
+            problem = (
+                "went elsewhere from the same seed under the same actions, so it cannot continue from a saved state"
             )
+            allowed = "environments that depend on their seed and actions alone"
+            raise FieldError("env", f"gymnasium:{self._id}", allowed, problem)
 
     def _make_vector(self, size: int) -> gymnasium.vector.SyncVectorEnv:
         vector = gymnasium.make_vec(
@@ -271,13 +294,14 @@ def _make(env_id: str, **options: Any) -> gymnasium.Env:
     try:
         env = gymnasium.make(env_id, **OPTIONS, **options)
     except (gymnasium.error.Error, ImportError) as error:
-        raise ValueError(f"env='gymnasium:{env_id}' cannot be made here: {error}") from error
+        problem = f"cannot be made here: {str(error).rstrip('.')}"
+        raise FieldError("env", f"gymnasium:{env_id}", "environments that `gymnasium.make` makes", problem) from error
     _keep_divergence(env)
     return env
 
 
 def _keep_divergence(env: gymnasium.Env) -> None:
-    """Has MuJoCo leave a diverged state as it is, for `terminated` to tell, and not begin anew within an episode."""
+    """Has MuJoCo leave a diverged state as it is, for `terminated` to tell, and not reset it within an episode."""
     model: Any = getattr(env.unwrapped, "model", None)
     if type(model).__name__ == "MjModel":
         import mujoco
@@ -292,31 +316,50 @@ def _same(there: tuple[Past, int] | None, wanted: tuple[Past, int]) -> bool:
     return there[0] is wanted[0] or np.array_equal(there[0].actions[: there[1]], wanted[0].actions[: wanted[1]])
 
 
-def _observations(env_id: str, space: spaces.Space) -> tuple[tuple[str, ...], tuple[tuple[float, float], ...]]:
-    """Names and limits of the observation entries. Raises `ValueError` for a space that is not supported."""
+def _make_spec(name: str, probe: gymnasium.Env, episode_steps: int | None) -> EnvSpec:
+    """What becomes of `probe`'s spaces and time limit. Raises `FieldError` for what is not supported."""
+    limit = registry[name.rpartition(":")[2]].max_episode_steps
+    limit = episode_steps if episode_steps is not None else limit if limit and limit > 0 else EPISODE_STEPS
+    validate.at_least("episode_steps", limit, 1)
+    obs_names, obs_limits = _observations(name, probe.observation_space)
+    return EnvSpec(
+        name=f"gymnasium:{name}",
+        obs_names=obs_names,
+        action_names=_actions(name, probe.action_space),
+        episode_steps=limit,
+        dt=_seconds(probe),
+        discrete=isinstance(probe.action_space, spaces.Discrete),
+        one_hot_obs=isinstance(probe.observation_space, spaces.Discrete),
+        has_reward=True,
+        obs_limits=obs_limits,
+    )
+
+
+def _observations(name: str, space: spaces.Space) -> tuple[tuple[str, ...], tuple[tuple[float, float], ...]]:
+    """Names and limits of the observation entries. Raises `FieldError` for a space that is not supported."""
     if isinstance(space, spaces.Discrete):
         return tuple(f"obs={space.start + i}" for i in range(space.n)), ((0.0, 1.0),) * int(space.n)
     parts = dict(space.spaces) if isinstance(space, spaces.Dict) else {"obs": space}
     names, limits = [], []
-    for name, part in parts.items():
+    for part_name, part in parts.items():
         if not isinstance(part, spaces.Box) or len(part.shape) != 1:
             picture = isinstance(part, spaces.Box) and len(part.shape) in (2, 3)
-            raise ValueError(
-                f"env='gymnasium:{env_id}' has observations {space}{': pictures' if picture else ''}. "
-                "Allowed: a Box of one axis, a Dict of such, or Discrete."
-            )
-        names += [f"{name}[{i}]" for i in range(part.shape[0])]
+            problem = f"has observations {space}{': pictures' if picture else ''}"
+            allowed = "a Box of one axis, a Dict of such, or Discrete"
+            raise FieldError("env", f"gymnasium:{name}", allowed, problem)
+        names += [f"{part_name}[{i}]" for i in range(part.shape[0])]
         limits += zip(part.low.astype(float).tolist(), part.high.astype(float).tolist(), strict=True)
     return tuple(names), tuple(limits)
 
 
-def _actions(env_id: str, space: spaces.Space) -> tuple[str, ...]:
-    """Names of the action entries or choices. Raises `ValueError` for a space that is not supported."""
+def _actions(name: str, space: spaces.Space) -> tuple[str, ...]:
+    """Names of the action entries or choices. Raises `FieldError` for a space that is not supported."""
     if isinstance(space, spaces.Discrete):
         return tuple(f"action={space.start + i}" for i in range(space.n))
     if isinstance(space, spaces.Box) and np.isfinite(space.low).all() and np.isfinite(space.high).all():
         return tuple(f"action[{i}]" for i in range(space.low.size))
-    raise ValueError(f"env='gymnasium:{env_id}' has actions {space}. Allowed: a Box with finite limits, or Discrete.")
+    allowed = "a Box with finite limits, or Discrete"
+    raise FieldError("env", f"gymnasium:{name}", allowed, f"has actions {space}")
 
 
 def _own(obs: Any, i: int) -> Any:

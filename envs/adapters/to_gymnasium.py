@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium import spaces
 
 from envs.base import EnvState
+from envs.stepper import prepared
 from jaxplore import validate
 
 NAMESPACE, VERSION = "jaxplore", 0
@@ -36,7 +37,7 @@ class GymnasiumEnv(gymnasium.Env):
         **options: the factory's own, such as `backend` and `obs_noise`.
 
     Raises:
-        ValueError: an unknown name, option or render mode, or a value that the factory refuses.
+        FieldError: an unknown name, option or render mode, or a value that the factory refuses.
 
     Example:
         >>> env = GymnasiumEnv("acrobot")
@@ -51,7 +52,7 @@ class GymnasiumEnv(gymnasium.Env):
     ) -> None:
         import envs
 
-        self._env = envs.make(name, **options)
+        self._env = prepared(envs.make(name, **options))
         spec, view = self._env.spec, self._env.view
         modes = ["rgb_array"] if view else []
         if render_mode is not None:
@@ -68,8 +69,6 @@ class GymnasiumEnv(gymnasium.Env):
             if spec.discrete
             else spaces.Box(-1.0, 1.0, (spec.action_size,), np.float32)
         )
-        compile_ = jax.jit if self._env.compiled else lambda function: function
-        self._reset, self._step = compile_(self._env.reset), compile_(self._env.step)
         self._cell = jax.jit(self._env.coverage.cell)
         self._state: EnvState | None = None
         self._frames: Iterator[np.ndarray] | None = None
@@ -77,7 +76,7 @@ class GymnasiumEnv(gymnasium.Env):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; see `gymnasium.Env.reset`. There are no `options`."""
         super().reset(seed=seed)
-        state = self._reset(jax.random.key(int(self.np_random.integers(2**31))))
+        state = self._env.reset(jax.random.key(int(self.np_random.integers(2**31))))
         self._state = state
         return self._seen(state.obs)
 
@@ -93,7 +92,7 @@ class GymnasiumEnv(gymnasium.Env):
             if not self.action_space.contains(action):
                 raise ValueError(f"action is {action!r}. Allowed: {self.action_space}.")
             action = np.eye(self._env.spec.action_size, dtype=np.float32)[int(action)]
-        self._state, transition = self._step(self._state, np.asarray(action, np.float32))
+        self._state, transition = self._env.step(self._state, np.asarray(action, np.float32))
         obs, info = self._seen(transition.next_obs)
         reward, terminated, truncated = jax.device_get((transition.reward, transition.terminated, transition.truncated))
         return obs, float(reward), bool(terminated), bool(truncated), info

@@ -50,7 +50,7 @@ class Progress:
 
     def update(self, step: int, rows: Sequence[Row]) -> None:
         """Shows a round: `step` environment steps are done, `rows` are the round's (one per seed)."""
-        if not self._learning and any("/" in name for row in rows for name in row):
+        if not self._learning and (_values(rows, "intrinsic_reward") or any("/" in n for row in rows for n in row)):
             self._recent.clear()
             self._learning = True
         self._recent.append((time.monotonic(), step))

@@ -82,16 +82,19 @@ class RunDirectory:
         if not (self.path / CONFIG).is_file():
             return Status.ABSENT
         try:
-            return Status(json.loads((self.path / OUTCOME).read_text())["status"])
+            found = Status(json.loads((self.path / OUTCOME).read_text())["status"])
         except FileNotFoundError:
-            pass
+            # Before there were outcomes the walk was a run's last file; a kept run has neither.
+            last = max((row["step"] for row in self.rows()), default=0) if self.is_kept() or self._has_walk() else 0
+            found = Status.FINISHED if last >= self.config().steps else Status.PARTIAL
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise self._unreadable(OUTCOME, error, "remove it, and finish with --resume") from error
-        # Before there were outcomes the walk was a run's last file; a kept run has neither.
-        if self.is_kept() or (self.path / WALK).is_file():
-            last = max((row["step"] for row in self.rows()), default=0)
-            return Status.FINISHED if last >= self.config().steps else Status.PARTIAL
-        return Status.PARTIAL
+        # Somebody has removed the walk, perhaps because it was damaged: it is written again by --resume.
+        lacks_walk = found is Status.FINISHED and not self.is_kept() and not self._has_walk()
+        return Status.PARTIAL if lacks_walk else found
+
+    def _has_walk(self) -> bool:
+        return (self.path / WALK).is_file()
 
     def is_kept(self) -> bool:
         """Whether this is what `keep` left of a run: it can be read, and not resumed."""
@@ -152,7 +155,7 @@ class RunDirectory:
         except (OSError, ValueError):
             return []
         now = runtime.versions()
-        return [f"{name}: {then[name]} -> {version}" for name, version in now.items() if then.get(name) != version]
+        return [f"{name}: {then[name]} -> {new}" for name, new in now.items() if then.get(name, new) != new]
 
     # What it came to.
 
@@ -170,7 +173,7 @@ class RunDirectory:
             with np.load(self.path / WALK) as walk:
                 return walk["positions"], walk["episode_steps"]
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise self._unreadable(WALK, error, f"remove it and {OUTCOME}, and finish with --resume") from error
+            raise self._unreadable(WALK, error, "remove it, and finish with --resume") from error
 
     def calibration(self) -> dict[str, Any] | None:
         """What `experiments.calibrate` found; None: it has not been asked.

@@ -86,7 +86,7 @@ class Session:
     """Environment steps taken."""
 
     def __init__(self, spec: RunSpec, directory: RunDirectory, env: Environment, agent: Explorer) -> None:
-        self.spec, self.directory, self.env = spec, directory, env
+        self.spec, self.directory, self.env, self.agent = spec, directory, env, agent
         self.config: RunConfig = spec.config
         self.programs: Programs = make_programs(spec.config, env, agent)
         evaluates = spec.config.eval_every > 0
@@ -98,6 +98,10 @@ class Session:
         """Take up the state to continue from, and open what is written to."""
         state, self.step, earlier = self.programs.init(), 0, 0.0
         restored = self.checkpoints.restore_latest(state, newer=NEWER) if resume else None
+        if restored is None and self.spec.parent is not None:
+            from experiments.training import parent  # Which restores states by this module.
+
+            state = parent.adopt(state, self.spec.parent, self.agent)
         if restored is not None:
             self._check_identity(restored.meta)
             self.step, state, earlier = restored.step, restored.state, restored.meta["wall_time"]

@@ -61,6 +61,9 @@ class Behaviour(NamedTuple):
     """The same without exploring, for evaluation: the action that the behaviour holds for the best. None: `act`."""
     bonus: Bonus | None = None
     """The intrinsic reward where the behaviour has one of its own."""
+    adopt: Callable[[Any, Any], Any] | None = None
+    """`adopt(state, actor) -> state`: with the policy of another behaviour's `actor`, to learn on from. None: there is
+    no policy that could be taken over and would stay."""
 
 
 def make_act(

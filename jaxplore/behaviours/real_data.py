@@ -176,4 +176,5 @@ def make_model_free(
         return train(learner, key, state, lesson, config.updates_per_round, nothing)
 
     act = make_act(learner, config.act_greedily, config.normalize_obs)
-    return Behaviour(learner.init, improve, learner.actor, act, make_act(learner, True, config.normalize_obs))
+    act_greedily = make_act(learner, True, config.normalize_obs)
+    return Behaviour(learner.init, improve, learner.actor, act, act_greedily, adopt=learner.adopt)

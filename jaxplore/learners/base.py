@@ -36,3 +36,6 @@ class Learner(NamedTuple):
     """`update(key, state, batch [B, ...]) -> (state, metrics)`, one gradient step of every network."""
     batch_size: int
     """Transitions that an update expects, `B`."""
+    adopt: Callable[[Any, Any], Any] | None = None
+    """`adopt(state, actor) -> state`: with the policy of another state's `actor` and everything else, such as critics,
+    as in `state`. None: it has no policy that can be taken over."""

@@ -142,6 +142,11 @@ def init(networks: SACNetworks, key: Key) -> SACState:
     return SACState(params, jax.tree.map(jnp.copy, params["v"]), networks.optimizer.init(params))
 
 
+def adopt(state: SACState, actor: Params) -> SACState:
+    """The state with another's policy, and critics, their slow copy and the optimiser as they are."""
+    return state.replace(params={**state.params, "policy": actor})
+
+
 def get_actor(state: SACState) -> Params:
     """The policy's parameters; see `Learner.actor`."""
     return state.params["policy"]
@@ -241,4 +246,5 @@ def make_sac(obs_size: int, action_size: int, config: SACConfig | None = None) -
         act_greedily=partial(act_greedily, networks),
         update=partial(update, networks),
         batch_size=config.batch_size,
+        adopt=adopt,
     )

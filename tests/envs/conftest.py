@@ -1,5 +1,7 @@
 """A bead on a rail: the smallest thing that both physics engines can run, with a closed form to check them against."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -19,10 +21,14 @@ BEAD = """
 """
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_bead():
-    """`make_bead(backend, obs_noise=0, episode_steps=7) -> Environment`. It starts at its key's own place, at rest."""
+    """`make_bead(backend, obs_noise=0, episode_steps=7) -> Environment`. It starts at its key's own place, at rest.
 
+    The same arguments give the same environment, whose programs are compiled once.
+    """
+
+    @functools.cache
     def make(backend, obs_noise=0.0, episode_steps=7):
         task = Task(
             spec=EnvSpec("bead", ("x [m]", "velocity [m/s]"), ("push [10 N]",), episode_steps, 0.02),

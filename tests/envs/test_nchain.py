@@ -10,7 +10,7 @@ from envs import coverage
 from envs.nchain import flip_states, make_nchain
 from envs.stepper import make_collect
 from experiments import loop
-from experiments.config import RunConfig
+from experiments.runs.config import RunConfig
 
 N = 40
 FORWARD, BACKWARD = np.eye(2, dtype=np.float32)

@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 from experiments import compare
-from experiments.config import preset_config, to_json
-from experiments.errors import RunError
+from experiments.analysis import statistics
+from experiments.runs.directory import RunDirectory
+from experiments.runs.errors import RunError
+from experiments.runs.presets import preset_config
+from experiments.runs.spec import RunSpec, to_json
 from tests.experiments.tiny import ROOT
 
 
@@ -18,7 +21,7 @@ def write_run(path: Path, method: str, seed: int, reached: list[int], steps: int
     """A finished run that sees its cells at the given steps."""
     path.mkdir()
     config = dataclasses.replace(preset_config("laptop"), method=method, seed=seed, steps=steps)
-    (path / "config.json").write_text(to_json(config))
+    (path / "config.json").write_text(to_json(RunSpec(config)))
     rows = []
     for step in range(25, steps + 1, 25):
         cells = sum(at <= step for at in reached)
@@ -45,13 +48,14 @@ def test_table_and_files(runs: list[Path], tmp_path: Path, capsys: pytest.Captur
     assert "| `random` | 1 | 3 (3 to 3) | 3 | - | 34% | 1.0 |" in lines
     record = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert record["methods"]["implicit"][1]["reached"] == [25, 50, 75, 100, 125, 150, 700]
-    random = {"seed": 0, "cells": 3, "reached": [25, 50, 625], "minutes": 1.0, "measures": {}, "posterior": None}
+    random = {"seed": 0, "cells": 3, "reached": [25, 50, 625], "minutes": 1.0, "measures": {}}
+    random |= {"calibration": None, "last_return": None}
     assert record["methods"]["random"][0] == random
     assert (tmp_path / "out" / "coverage.png").stat().st_size > 10_000
 
 
 def test_curves_hold_the_last_value_known(runs: list[Path]):
-    _, (implicit, random) = compare.group(runs)
+    _, (implicit, random) = statistics.group(runs)
     assert list(implicit.steps[:2]) == [30, 40], "of a hundred points the first is after the first round"
     assert len(implicit.steps) == 98
     every_tenth = implicit.steps % 100 == 0
@@ -61,20 +65,20 @@ def test_curves_hold_the_last_value_known(runs: list[Path]):
 
 def test_runs_of_different_lengths_meet_at_a_step(runs: list[Path], tmp_path: Path):
     short = write_run(tmp_path / "short", "implicit", 9, [25, 400], steps=500)
-    config, (implicit, random) = compare.group([*runs, short], until=500)
-    assert config.steps == implicit.steps[-1] == 500
+    first, (implicit, random) = statistics.group([*runs, short], until=500)
+    assert first.config.steps == implicit.steps[-1] == 500
     assert [outcome.cells for outcome in implicit.outcomes] == [4, 6, 4, 2]
     assert random.outcomes[0].reached == (25, 50)
     with pytest.raises(RunError, match="short stands at step 500 of 600"):
-        compare.group([short], until=600)
+        statistics.group([short], until=600)
 
 
 def test_the_interval_is_students():
     # mean 2, standard error 1 / sqrt(3), and 4.3027 as every table of t has it for 2 degrees of freedom
-    mean, half_width = compare.interval(np.array([1.0, 2.0, 3.0]))
+    mean, half_width = statistics.interval(np.array([1.0, 2.0, 3.0]))
     assert mean == 2.0
     assert half_width == pytest.approx(4.3027 / np.sqrt(3), rel=1e-4)
-    assert compare.interval(np.array([5.0])) == (5.0, None)
+    assert statistics.interval(np.array([5.0])) == (5.0, None)
 
 
 def test_names_tell_settings_of_one_method_apart(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture):
@@ -133,7 +137,7 @@ def add_belief(run: Path, error: float, ratio: float, told: float | None, step: 
     path.write_text("".join(json.dumps(row) + "\n" for row in rows))
     sets = {"its data": {"error_per_variance": ratio, "rank": 0.5}, "new, its own policy": {"rank": None}}
     found = {"step": step, "seeds": [{"seed": row["seed"], "sets": sets, "unseen_told_from_data": told}]}
-    (run / "posterior.json").write_text(json.dumps(found))
+    (run / "calibration.json").write_text(json.dumps(found))
 
 
 def test_beliefs_are_told_of_where_there_are_any(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture):
@@ -149,14 +153,14 @@ def test_beliefs_are_told_of_where_there_are_any(runs: list[Path], tmp_path: Pat
     assert total.startswith("4 min 00 s of wall time")
     assert (tmp_path / "out" / "variance.png").stat().st_size > 10_000
     record = json.loads((tmp_path / "out" / "comparison.json").read_text())["methods"]["implicit"]
-    assert record[1]["measures"]["model_error"] == 1.5 and record[1]["posterior"]["seed"] == 1
-    assert record[2]["posterior"] is None
+    assert record[1]["measures"]["model_error"] == 1.5 and record[1]["calibration"]["seed"] == 1
+    assert record[2]["calibration"] is None
 
 
 def test_a_damaged_answer_is_told(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture):
-    (runs[0] / "posterior.json").write_text("{")
+    (runs[0] / "calibration.json").write_text("{")
     assert compare.main([*map(str, runs), f"--out={tmp_path / 'out'}"]) == 1
-    assert f"What to do: python -m experiments.posterior {runs[0]}" in capsys.readouterr().err
+    assert f"What to do: python -m experiments.calibrate {runs[0]}" in capsys.readouterr().err
 
 
 def test_what_is_kept_of_runs_compares_as_they_do(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture):
@@ -165,7 +169,11 @@ def test_what_is_kept_of_runs_compares_as_they_do(runs: list[Path], tmp_path: Pa
     assert compare.main([*map(str, runs), f"--out={tmp_path / 'out'}", f"--keep={kept}"]) == 0
     told = capsys.readouterr().out
     assert sorted(path.name for path in kept.iterdir()) == ["a", "b", "c", "d"]
-    assert sorted(path.name for path in (kept / "a").iterdir()) == ["config.json", "metrics.jsonl.gz", "posterior.json"]
+    assert sorted(path.name for path in (kept / "a").iterdir()) == [
+        "calibration.json",
+        "config.json",
+        "metrics.jsonl.gz",
+    ]
     # compared again, and kept again where they are: the same tables, the same bytes
     before = (kept / "a" / "metrics.jsonl.gz").read_bytes()
     assert compare.main([*(str(kept / run.name) for run in runs), f"--out={tmp_path / 'two'}", f"--keep={kept}"]) == 0
@@ -177,17 +185,17 @@ def test_what_is_kept_of_runs_compares_as_they_do(runs: list[Path], tmp_path: Pa
 
 def test_committed_runs_are_there_and_are_what_the_readme_shows():
     kept = ROOT / "experiments/results/runs"
-    _, groups = compare.group([*kept.glob("ant-implicit-s?"), *kept.glob("ant-random")], until=4_000)
-    readme = (ROOT / "README.md").read_text()
+    _, groups = statistics.group([*kept.glob("ant-implicit-s?"), *kept.glob("ant-random")], until=4_000)
+    readme = (ROOT / "experiments/results/README.md").read_text()
     for one in groups:
         assert len(one.outcomes) == 5
-        mean, half_width = compare.interval(one.coverage.mean(axis=1))
+        mean, half_width = statistics.interval(one.coverage.mean(axis=1))
         shown = f"{mean:.0%} +- {100 * half_width:.0f}"
         assert re.search(rf"^\| `{one.label}` \| [\d, ]+ \| {re.escape(shown)} \|", readme, re.M)
 
 
 def test_damaged_metrics_are_told(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture):
-    compare.keep(runs[0], tmp_path / "kept")
+    RunDirectory(runs[0]).keep(tmp_path / "kept")
     packed = tmp_path / "kept" / "a" / "metrics.jsonl.gz"
     packed.write_bytes(packed.read_bytes()[:-20])
     assert compare.main([str(packed.parent), f"--out={tmp_path / 'out'}"]) == 1

@@ -3,13 +3,14 @@
 import pytest
 
 from experiments import run
-from experiments.config import PRESETS, preset_config
+from experiments.runs.config import PRESETS
+from experiments.runs.presets import preset_config
 from tests.experiments.tiny import rows
 
 TINY_CHAIN = (
     *("--env=nchain", "--preset=smoke", "--steps=12", "--warm-up-steps=8", "--checkpoint-every=6"),
     *("--dynamics.hidden", "4", "--generator.hidden", "4", "--generator.noise-size=2", "--svgd.num-particles=2"),
-    *("--imagination.num-models=2", "--mcts.num-iterations=4", "--mcts.num-trajectories=2", "--mcts.horizon=5"),
+    *("--mcts.num-iterations=4", "--mcts.num-trajectories=2", "--mcts.horizon=5"),
 )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments import render
-from experiments.errors import RunError
+from experiments.runs.errors import RunError
 from tests.experiments.tiny import ROOT
 
 

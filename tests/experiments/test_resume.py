@@ -10,8 +10,13 @@ from pathlib import Path
 import pytest
 
 import envs
-from experiments import log, loop, run
-from experiments.checkpoint import Checkpoints
+from envs import stepper
+from experiments import run
+from experiments.runs.checkpoint import Checkpoints
+from experiments.runs.directory import RunDirectory
+from experiments.runs.metrics import MetricsLog
+from experiments.runs.tensorboard import TensorBoardLog
+from experiments.training import build, loop
 from tests.experiments import tiny
 from tests.experiments.tiny import ROOT, STEPS, TINY, assert_same_run, rows
 
@@ -20,7 +25,8 @@ POINT = ("--env=point", *TINY)
 # The command line with the point in it, and a hook: `{where}` is called as usual `{times}` times, and then kills.
 KILLED = """
 import os, sys, envs
-from experiments import checkpoint, log, loop, run
+from experiments import run
+from experiments.runs import checkpoint, metrics
 from tests.experiments.tiny import make_point
 
 envs.FACTORIES["point"] = make_point
@@ -64,13 +70,13 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_killed_between_checkpoints(tell, point: str, whole: Path, tmp_path: Path):
     """Before a row is written, in another process than the one that resumes."""
     out = tmp_path / "run"
-    killed(out, "log.MetricsLog.append", 3, *POINT)
+    killed(out, "metrics.MetricsLog.append", 3, *POINT)
     assert Checkpoints(out / "checkpoints").steps() == [25, 50]
     assert len(rows(out)) == 3
     assert not (out / "walk.npz").exists()
     told = tell(out, "--resume")
     assert told.status == 0
-    assert "Going on from step 50" in told.stderr
+    assert "Continuing from step 50" in told.stderr
     assert_same_run(whole, out)
 
 
@@ -82,12 +88,13 @@ def test_killed_over_and_over(tell, point: str, whole: Path, tmp_path: Path, mon
 
     out = tmp_path / "run"
     moments = [
-        (run, "write_config", True),
-        (log.MetricsLog, "append", True),
+        (RunDirectory, "begin", True),
+        (MetricsLog, "append", True),
         (Checkpoints, "save", False),
         (Checkpoints, "save", True),
-        (log.TensorBoardLog, "append", True),
-        (loop, "_write_walk", False),
+        (TensorBoardLog, "append", True),
+        (RunDirectory, "write_walk", False),
+        (RunDirectory, "write_outcome", False),
     ]
     for place, name, after in moments:
         original = getattr(place, name)
@@ -106,7 +113,7 @@ def test_killed_over_and_over(tell, point: str, whole: Path, tmp_path: Path, mon
 
 def test_killed_before_the_first_checkpoint_a_run_starts_over(tell, point: str, whole: Path, tmp_path: Path):
     out = tmp_path / "run"
-    killed(out, "checkpoint._flush", 0, *POINT)
+    killed(out, "checkpoint.sync", 0, *POINT)
     assert Checkpoints(out / "checkpoints").steps() == []
     assert len(rows(out)) == 1
     told = tell(out, "--resume")
@@ -118,7 +125,7 @@ def test_killed_before_the_first_checkpoint_a_run_starts_over(tell, point: str, 
 def test_kill_9_while_saving_the_ant(tell, finished, tmp_path: Path):
     """A real kill, of the real command, in the middle of a save."""
     out = tmp_path / "run"
-    process = start(KILLED.format(where="checkpoint._flush", times=10**9), out, "--env=ant_maze", *TINY)
+    process = start(KILLED.format(where="checkpoint.sync", times=10**9), out, "--env=ant_maze", *TINY)
     saving = out / "checkpoints" / "saving-50"
     deadline = time.monotonic() + 280
     while not saving.exists() and process.poll() is None and time.monotonic() < deadline:
@@ -129,7 +136,7 @@ def test_kill_9_while_saving_the_ant(tell, finished, tmp_path: Path):
     assert Checkpoints(out / "checkpoints").steps() in ([25], [25, 50])
     told = tell(out, "--resume")
     assert told.status == 0
-    assert "Going on from step " in told.stderr
+    assert "Continuing from step " in told.stderr
     assert_same_run(finished.out, out)
     assert sorted(path.name for path in (out / "checkpoints").iterdir()) == ["75", "81"]
 
@@ -139,13 +146,13 @@ def test_a_damaged_checkpoint_falls_back_and_ends_the_same(
 ):
     out = tmp_path / "run"
     with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
-        patch.setattr(loop, "_write_walk", lambda *_: 1 / 0)
+        patch.setattr(RunDirectory, "write_walk", lambda *_: 1 / 0)
         run.main([f"--out={out}", *POINT])
     (out / "checkpoints" / "81" / "manifest.json").write_text("")
     told = tell(out, "--resume")
     assert told.status == 0
     assert "the checkpoint of step 81 is damaged" in told.stderr
-    assert "Going on from step 75" in told.stderr
+    assert "Continuing from step 75" in told.stderr
     assert_same_run(whole, out)
 
 
@@ -155,7 +162,7 @@ def test_mjx_resumes_to_the_bit(tell, tmp_path: Path):
     whole = tell(tmp_path / "whole", *ant)
     assert whole.status == 0
     out = tmp_path / "run"
-    killed(out, "log.MetricsLog.append", 3, *ant)
+    killed(out, "metrics.MetricsLog.append", 3, *ant)
     assert tell(out, "--resume").status == 0
     assert_same_run(whole.out, out)
 
@@ -174,16 +181,16 @@ def test_each_program_is_traced_once(
 
         return call
 
-    make_explorer, make_collect, make_collect_all = loop.make_explorer, loop.make_collect, loop.make_collect_all
+    make_explorer, make_collect, make_collect_all = build.make_explorer, stepper.make_collect, stepper.make_collect_all
 
     def make_counted_explorer(*args):
         explorer = make_explorer(*args)
         names = ("improve", "act", "init")
         return explorer._replace(**{name: counted(name, getattr(explorer, name)) for name in names})
 
-    monkeypatch.setattr(loop, "make_explorer", make_counted_explorer)
-    monkeypatch.setattr(loop, "make_collect", lambda *args: counted("collect", make_collect(*args)))
-    monkeypatch.setattr(loop, "make_collect_all", lambda *args: counted("collect", make_collect_all(*args)))
+    monkeypatch.setattr(build, "make_explorer", make_counted_explorer)
+    monkeypatch.setattr(stepper, "make_collect", lambda *args: counted("collect", make_collect(*args)))
+    monkeypatch.setattr(stepper, "make_collect_all", lambda *args: counted("collect", make_collect_all(*args)))
     out = tmp_path / "run"
     assert tell(out, f"--env={env}", *TINY).status == 0
     assert traces["improve"] == 1
@@ -197,7 +204,7 @@ def test_each_program_is_traced_once(
 
 
 def test_rounds_start_where_they_would_have():
-    config = run.parse(["--preset=smoke", "--steps=601"])[1]
+    config = run.parse(["--preset=smoke", "--steps=601"])[1].config
     whole = list(loop.rounds(config, 0))
     assert whole[0] == (0, 25)
     assert (250, 256) in whole

@@ -15,11 +15,15 @@ import pytest
 from matplotlib.image import imread
 
 import envs
-from experiments import log, loop, run
-from experiments.checkpoint import Checkpoints
-from experiments.config import PRESETS, flag, from_json, preset_config, to_json
-from experiments.errors import RunError
-from experiments.flags import document
+from experiments import run
+from experiments.runs import console, metrics
+from experiments.runs.checkpoint import Checkpoints
+from experiments.runs.config import PRESETS, flag
+from experiments.runs.directory import RunDirectory, Status
+from experiments.runs.flags import document
+from experiments.runs.presets import preset_config
+from experiments.runs.spec import RunSpec, from_json, to_json
+from experiments.training import loop, record
 from jaxplore import beliefs, methods
 from jaxplore.methods import Method
 from tests.experiments.tiny import CELLS, ROOT, STEPS, TINY, assert_same_run, leaves, make_point, rows
@@ -32,7 +36,7 @@ RANDOM = (
 
 
 def parse(*words: str):
-    return run.parse(words)[1]
+    return run.parse(words)[1].config
 
 
 def everything_in(folder: Path) -> list[str]:
@@ -62,7 +66,8 @@ def test_a_run_leaves_all_its_files_and_no_scraps(finished):
     names = {path.name for path in finished.out.iterdir()}
     pictures = {"coverage.png", "visitation.png", "intrinsic_reward.png"}
     assert names == {
-        *("config.json", "versions.json", "metrics.jsonl", "walk.npz", "checkpoints", "tensorboard"),
+        *("config.json", "versions.json", "scene.json", "metrics.jsonl", "walk.npz", "outcome.json"),
+        *("checkpoints", "tensorboard"),
         *pictures,
     }
     assert Checkpoints(finished.out / "checkpoints").steps() == [75, 81]
@@ -76,7 +81,7 @@ def test_a_run_leaves_all_its_files_and_no_scraps(finished):
 def test_a_run_ends_with_what_can_be_done_next(finished):
     *_, move, ask = finished.stdout.splitlines()
     assert move == f"To see it move: python -m experiments.render {finished.out}"
-    assert ask == f"To ask what its models know: python -m experiments.posterior {finished.out}"
+    assert ask == f"To ask what its models know: python -m experiments.calibrate {finished.out}"
 
 
 def test_the_walk_is_where_each_step_began(finished):
@@ -106,7 +111,7 @@ def test_a_run_tells_what_it_does_and_closes_with_a_table(finished):
 
 
 def test_the_saved_configuration_gives_the_same_run(finished, tell, tmp_path: Path):
-    config = from_json((finished.out / "config.json").read_text(), "config.json")
+    config = from_json((finished.out / "config.json").read_text(), "config.json").config
     assert config == dataclasses.replace(parse(*TINY), backend="mujoco")
     again = tell(tmp_path / "again", f"--config={finished.out / 'config.json'}")
     assert again.status == 0
@@ -167,10 +172,10 @@ def test_a_run_shorter_than_its_pictures_have_panels(tell, point: str, tmp_path:
 
 def test_without_out_a_run_makes_its_own_place(point: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
-    config, command = parse("--env=point", "--method=random", "--seed=3"), run.CommandLine()
-    assert run.choose_directory(command, config) == Path("runs/point-random-laptop-seed3")
+    command, spec = run.parse(["--env=point", "--method=random", "--seed=3"])
+    assert run.choose_directory(command, spec).path == Path("runs/point-random-laptop-seed3")
     (tmp_path / "runs/point-random-laptop-seed3").mkdir(parents=True)
-    assert run.choose_directory(command, config) == Path("runs/point-random-laptop-seed3-2")
+    assert run.choose_directory(command, spec).path == Path("runs/point-random-laptop-seed3-2")
 
 
 # Flags.
@@ -282,7 +287,7 @@ def test_bad_flags_are_refused_and_nothing_is_written(
 
 def test_preset_and_configuration_must_agree(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     path = tmp_path / "c.json"
-    path.write_text(to_json(preset_config("smoke")))
+    path.write_text(to_json(RunSpec(preset_config("smoke"))))
     assert run.main([f"--config={path}", "--preset=paper", f"--out={tmp_path / 'run'}"]) == 2
     assert re.search(r"--preset=paper disagrees with .*c\.json, which has 'smoke'", capsys.readouterr().err)
     path.write_bytes(b"\xff")
@@ -372,7 +377,7 @@ def test_resume_with_another_configuration_names_the_differences(small, tell):
     told = tell(small.out, "--resume", "--seed=4", "--sac.lr=0.5", "--method=implicit")
     assert told.status == 2
     assert (
-        f"--resume: the configuration disagrees with {small.out / 'config.json'} in method: 'random' -> 'implicit'; "
+        f"--resume: the configuration disagrees with the one saved in {small.out} in method: 'random' -> 'implicit'; "
         "seed: 0 -> 4; sac.lr: 0.001 -> 0.5. Resume with the saved values, or start a run in another --out."
     ) in told.stderr
 
@@ -439,7 +444,7 @@ def test_a_full_disk_ends_the_run_and_spares_the_last_checkpoint(
     what: str, last: int, small, tell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     out = tmp_path / "full"
-    append, save = log.MetricsLog.append, Checkpoints.save
+    append, save = metrics.MetricsLog.append, Checkpoints.save
     with monkeypatch.context() as patch:
 
         def append_until_full(self, told):
@@ -453,7 +458,7 @@ def test_a_full_disk_ends_the_run_and_spares_the_last_checkpoint(
             save(self, step, *rest)
 
         if what == "metrics":
-            patch.setattr(log.MetricsLog, "append", append_until_full)
+            patch.setattr(metrics.MetricsLog, "append", append_until_full)
         elif what == "checkpoint":
             patch.setattr(Checkpoints, "save", save_until_full)
         elif what == "walk":
@@ -480,7 +485,7 @@ def test_ctrl_c_says_how_to_go_on(tell, point: str, tmp_path: Path, monkeypatch:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(log.Progress, "update", interrupt)
+        patch.setattr(console.Progress, "update", interrupt)
         told = tell(out, *RANDOM)
     assert told.status == 130
     (line,) = [line for line in told.stderr.splitlines() if line.startswith("Stopped.")]
@@ -496,53 +501,65 @@ def test_an_error_in_the_program_is_not_taken_for_bad_input(
     def broken(*_: Any):
         raise ValueError("a bug")
 
-    monkeypatch.setattr(loop, "_rows", broken)
+    monkeypatch.setattr(record, "rows", broken)
     with pytest.raises(ValueError, match="a bug"):
         tell(tmp_path / "run", *RANDOM)
 
 
-@pytest.mark.parametrize("breaks", ["metric", "state"])
-def test_numbers_that_are_not_finite_end_the_run(
-    breaks: str, tell, point: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
-    def belief(sizes, config):
-        def update(key, state, data, normalizers):
-            # Seed 1 alone breaks, once 50 steps have come; seed 0 must be taken back with it.
-            bad = jnp.where((data.size >= 50) & (state["seed"] > 0), jnp.inf, 0.0)
-            told = {"loss": 1.0 + (bad if breaks == "metric" else 0.0)}
-            return {**state, "value": state["value"] + 1.0 + (bad if breaks == "state" else 0.0)}, told
+@pytest.fixture
+def fragile(monkeypatch: pytest.MonkeyPatch):
+    """`fragile(breaks, *seeds)`: a method whose numbers break at step 50, in those seeds of a run of two."""
 
-        def init(key):
-            return {"value": jnp.zeros(()), "seed": jnp.zeros(())}
+    def make(breaks: str, *seeds: int) -> None:
+        def belief(sizes, config):
+            def update(key, state, data, normalizers):
+                bad = jnp.where((data.size >= 50) & state["breaks"], jnp.inf, 0.0)
+                report = {"loss": 1.0 + (bad if breaks == "metric" else 0.0)}
+                return {**state, "value": state["value"] + 1.0 + (bad if breaks == "state" else 0.0)}, report
 
-        return beliefs.Belief(init, update, lambda key, state, num: (), None)
+            def init(key):
+                return {"value": jnp.zeros(()), "breaks": jnp.zeros((), bool)}
 
-    monkeypatch.setitem(
-        methods.METHODS, "fragile", Method("breaks", belief, methods.no_reward, methods.uniform_actions)
-    )
-    original = loop.make_programs
+            return beliefs.Belief(init, update, lambda key, state, num: (), None, fit_config=config.fit)
 
-    def make_programs(config, env, explorer):
-        programs = original(config, env, explorer)
+        row = Method("breaks", belief, methods.no_reward, methods.uniform_actions)
+        monkeypatch.setitem(methods.METHODS, "fragile", row)
+        original = loop.make_programs
 
-        def init():
-            state = programs.init()
-            own = {**state.explorer.belief, "seed": jnp.arange(2.0)}
-            return dataclasses.replace(state, explorer=dataclasses.replace(state.explorer, belief=own))
+        def make_programs(config, env, explorer):
+            programs = original(config, env, explorer)
 
-        return programs._replace(init=init)
+            def init():
+                state = programs.init()
+                broken = jnp.array([seed in seeds for seed in range(config.seed, config.seed + config.num_seeds)])
+                own = {**state.explorer.belief, "breaks": broken}
+                return dataclasses.replace(state, explorer=dataclasses.replace(state.explorer, belief=own))
 
-    monkeypatch.setattr(loop, "make_programs", make_programs)
+            return programs._replace(init=init)
+
+        monkeypatch.setattr(loop, "make_programs", make_programs)
+
+    return make
+
+
+FRAGILE = ("--env=point", "--method=fragile")
+QUANTITIES = {"metric": "fit/loss", "state": "the state of the belief"}
+
+
+@pytest.mark.parametrize("breaks", QUANTITIES)
+def test_numbers_that_are_not_finite_end_the_run(breaks: str, fragile, tell, point: str, tmp_path: Path):
+    fragile(breaks, 0, 1)
     out = tmp_path / "run"
-    told = tell(out, "--env=point", "--method=fragile", "--num-seeds=2", *TINY)
+    told = tell(out, *FRAGILE, "--num-seeds=2", *TINY)
     assert told.status == 1
-    quantity = {"metric": "fit/loss", "state": "the state of the belief"}[breaks]
     assert (
-        f"error: the round of steps 31 to 50 came out with numbers that are not finite: {quantity} (seed 1). "
-        f"The state before it is saved in {out / 'checkpoints'}. What to do: "
+        f"error: the round of steps 31 to 50 came out with numbers that are not finite: {QUANTITIES[breaks]} "
+        f"(seed 0, 1). The state before it is saved in {out / 'checkpoints'}. What to do: "
     ) in told.stderr
-    assert "smaller --fit.lr" in told.stderr
-    assert [row["step"] for row in rows(out)] == [25, 25, 31, 31]
+    assert "smaller learning rate, such as --fit.lr" in told.stderr
+    assert [row["step"] for row in rows(out)] == [25, 25, 31, 31, 50, 50]
+    assert [row.get("diverged") for row in rows(out)] == [None] * 4 + [QUANTITIES[breaks]] * 2
+    assert RunDirectory(out).status() is Status.DIVERGED
     assert Checkpoints(out / "checkpoints").steps()[-1] == 31
     saved = leaves(out, 31)
     sizes, values = (
@@ -551,18 +568,38 @@ def test_numbers_that_are_not_finite_end_the_run(
     )
     np.testing.assert_array_equal(sizes, [31, 31])
     np.testing.assert_array_equal(values, [2.0, 2.0])
-    assert tell(out, "--resume").stderr.count("steps 31 to 50 came out") == 1
+    again = tell(out, "--resume")
+    assert again.status == 2
+    assert "every seed came out with numbers that are not finite" in again.stderr
+
+
+def test_a_seed_that_diverges_stops_alone(fragile, tell, point: str, tmp_path: Path):
+    # seed 1 breaks at step 50: its last row says so, and seed 0 ends as if it had not been there, to the bit
+    fragile("metric", 1)
+    alone, both = tmp_path / "alone", tmp_path / "both"
+    assert tell(alone, *FRAGILE, *TINY).status == 0
+    told = tell(both, *FRAGILE, "--num-seeds=2", *TINY)
+    assert told.status == 0
+    assert "Seed 1 stops at step 50: numbers that are not finite (fit/loss). The others continue." in told.stderr
+    assert "seed 1 diverged at step 50: not finite was fit/loss" in told.stdout
+    assert [row["step"] for row in rows(both) if row["seed"] == 1] == [25, 31, 50]
+    assert [row["step"] for row in rows(both) if "diverged" in row] == [50]
+    assert [row for row in rows(both) if row["seed"] == 0] == rows(alone)
+    assert RunDirectory(both).status() is Status.FINISHED
+    outcome = json.loads((both / "outcome.json").read_text())
+    assert outcome == {"status": "finished", "diverged": {"1": {"step": 50, "what": "fit/loss"}}}
+    # and so it is when the run is resumed after that
+    (both / "walk.npz").unlink()
+    assert tell(both, "--resume").status == 0
+    assert json.loads((both / "outcome.json").read_text()) == outcome
 
 
 def test_numbers_are_looked_at_by_name():
-    with pytest.raises(RunError, match=r"a, c \(seed 6\)"):
-        raise loop._diverged(
-            {"a": np.array([True, False]), "b": np.array([True, True]), "c": np.array([True, False])},
-            dataclasses.replace(preset_config("smoke"), seed=5, num_seeds=2),
-            50,
-            75,
-            Path("run"),
-        )
+    finite = {"a": np.array([True, False]), "b": np.array([True, True]), "c": np.array([True, False])}
+    assert record.broken(finite, np.array([True, True])) == [[], ["a", "c"]]
+    assert record.broken(finite, np.array([True, False])) == [[], []]
+    error = record.diverged_error(RunDirectory("run"), ["a", "c"], [6], (50, 75))
+    assert re.search(r"steps 50 to 75 came out with numbers that are not finite: a, c \(seed 6\)", str(error))
 
 
 def test_steps_that_diverged_are_dropped_counted_and_told(tell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

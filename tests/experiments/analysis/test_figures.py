@@ -1,0 +1,169 @@
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+
+from envs.base import FloorPlan
+from experiments.analysis.figures import Curves, plot_coverage, plot_intrinsic_reward, plot_visitation
+from experiments.analysis.figures.curves import _smooth
+from experiments.runs.errors import RunError
+from experiments.runs.scene import Cells
+
+COVERAGE = Cells(3, "maze cells")
+PLAN = FloorPlan(
+    position=(0, 1),
+    walls=((-3.0, 1.0, 5.0, 3.0), (-3.0, -3.0, 5.0, -1.0)),
+    cells=((-1.0, -1.0, 1.0, 1.0), (1.0, -1.0, 3.0, 1.0), (3.0, -1.0, 5.0, 1.0)),
+)
+STEPS = np.arange(25, 1001, 25)
+
+
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """The figures that are saved."""
+    saved: list[Figure] = []
+    original = Figure.savefig
+
+    def savefig(self: Figure, *args: Any, **kwargs: Any) -> None:
+        original(self, *args, **kwargs)
+        saved.append(self)
+
+    monkeypatch.setattr(Figure, "savefig", savefig)
+    return saved
+
+
+def seeds(count: int) -> np.ndarray:
+    return np.stack([np.minimum(3, 1 + STEPS // (300 + 50 * seed)) / 3 for seed in range(count)])
+
+
+def check_picture(path: Path, width: int) -> np.ndarray:
+    """A picture of at least `width` pixels that is neither blank nor cut off at its edges."""
+    pixels = imread(path)[..., :3]
+    assert pixels.shape[1] >= width
+    assert 0.01 < (pixels.mean(-1) < 0.95).mean() < 0.9
+    for edge in (pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]):
+        assert (edge == 1).all(), "something touches the edge"
+    assert [entry.name for entry in path.parent.glob("*.tmp*")] == []
+    return pixels
+
+
+def test_coverage_of_one_seed(tmp_path: Path, figures: list[Figure]):
+    plot_coverage(tmp_path / "c.png", [Curves("implicit", STEPS, seeds(1))], COVERAGE)
+    check_picture(tmp_path / "c.png", 1000)
+    (axes,) = figures[0].axes
+    legend = axes.get_legend()
+    assert legend is not None
+    assert [text.get_text() for text in legend.get_texts()] == ["implicit, n = 1"]
+    assert axes.get_xlim() == (0, 1000)
+
+
+def test_coverage_of_several_seeds_and_methods(tmp_path: Path, figures: list[Figure]):
+    groups = [Curves("implicit", STEPS, seeds(5)), Curves("random", STEPS, seeds(3) / 2)]
+    plot_coverage(tmp_path / "c.png", groups, COVERAGE, title="Ant maze")
+    check_picture(tmp_path / "c.png", 1000)
+    (axes,) = figures[0].axes
+    bold = {line.get_label(): line for line in axes.lines if not str(line.get_label()).startswith("_")}
+    assert list(bold) == ["implicit, median of n = 5", "random, median of n = 3"]
+    np.testing.assert_array_equal(bold["implicit, median of n = 5"].get_ydata(), seeds(5)[2])
+    assert len(axes.lines) == 5 + 3 + 2 + COVERAGE.num_cells
+    assert axes.get_title(loc="left") == "Ant maze"
+
+
+def test_visitation_has_a_panel_per_quarter(tmp_path: Path, figures: list[Figure]):
+    rng = np.random.default_rng(0)
+    position = np.cumsum(rng.normal(size=(1000, 2)) * 0.02, axis=0).clip([-1, -1], [5, 1])
+    age = 1 + np.arange(1000) % 300
+    plot_visitation(tmp_path / "v.png", (position, age), [1, 1, 2, 3], PLAN, COVERAGE)
+    check_picture(tmp_path / "v.png", 1500)
+    *panels, bar = figures[0].axes
+    assert [axes.get_title(loc="left") for axes in panels] == ["250 steps", "500 steps", "750 steps", "1,000 steps"]
+    assert [axes.get_title(loc="right") for axes in panels] == [f"{n} of 3 maze cells" for n in (1, 1, 2, 3)]
+    assert bar.get_ylabel() == "step of the episode"
+    for count, axes in zip((250, 500, 750, 1000), panels, strict=True):
+        walls, _, points = axes.collections
+        assert axes.get_aspect() == 1
+        assert len(walls.get_paths()) == 2
+        shown = np.asarray(points.get_offsets())
+        np.testing.assert_array_equal(np.sort(shown, axis=0), np.sort(position[:count], axis=0))
+        colours = points.get_cmap()(points.norm(np.array([1, 300])))
+        assert colours[0, 2] > 0.8 > 0.2 > colours[0, 0], "early is blue"
+        assert colours[1, 0] > 0.8 > 0.2 > colours[1, 2], "late is red"
+
+
+@pytest.mark.parametrize(
+    ("positions", "ages", "cells", "message"),
+    [
+        (np.zeros((5, 3)), np.zeros(5), [1], "positions"),
+        (np.zeros((5, 2)), np.zeros(4), [1], "episode_steps"),
+        (np.zeros((3, 2)), np.zeros(3), [1, 1, 1, 1], "cells_seen"),
+        (np.zeros((3, 2)), np.zeros(3), [], "cells_seen"),
+    ],
+)
+def test_visitation_refuses_what_does_not_match(
+    tmp_path: Path, positions: np.ndarray, ages: np.ndarray, cells: list[int], message: str
+):
+    with pytest.raises(ValueError, match=message):
+        plot_visitation(tmp_path / "v.png", (positions, ages), cells, PLAN, COVERAGE)
+
+
+@pytest.mark.parametrize(("decay", "scale"), [(100.0, "log"), (1e6, "linear")])
+def test_intrinsic_reward_chooses_its_scale(tmp_path: Path, figures: list[Figure], decay: float, scale: str):
+    values = np.exp(-STEPS / decay)[None].repeat(3, 0)
+    values[:, :2] = np.nan
+    plot_intrinsic_reward(tmp_path / "r.png", [Curves("implicit", STEPS, values)])
+    check_picture(tmp_path / "r.png", 1000)
+    (axes,) = figures[0].axes
+    assert axes.get_yscale() == scale
+    assert len(axes.lines) == 4
+
+
+def test_intrinsic_reward_that_does_not_exist_says_so(tmp_path: Path, figures: list[Figure]):
+    plot_intrinsic_reward(tmp_path / "r.png", [Curves("random", STEPS, np.full((2, len(STEPS)), np.nan))])
+    assert [text.get_text() for text in figures[0].axes[0].texts] == ["this method has no intrinsic reward"]
+    assert (tmp_path / "r.png").exists()
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, -1.0])
+def test_constant_rewards_and_single_rows_are_drawn(tmp_path: Path, value: float):
+    plot_intrinsic_reward(tmp_path / "r.png", [Curves("a", STEPS, np.full((1, len(STEPS)), value))])
+    plot_intrinsic_reward(tmp_path / "s.png", [Curves("a", STEPS[:1], np.full((1, 1), value))])
+    plot_coverage(tmp_path / "c.png", [Curves("a", STEPS[:1], np.full((1, 1), 0.5))], COVERAGE)
+
+
+def test_smoothing_is_the_mean_of_what_is_there():
+    values = np.array([np.nan, 1.0, 3.0, np.nan, 5.0, 1.0])
+    np.testing.assert_allclose(_smooth(values, 3), [np.nan, 2, 2, np.nan, 3, 3])
+    np.testing.assert_array_equal(_smooth(values, 1), values)
+    np.testing.assert_allclose(_smooth(np.array([2.0]), 1), [2])
+
+
+@pytest.mark.parametrize("values", [np.zeros(40), np.zeros((2, 39)), np.zeros((0, 40))])
+def test_curves_of_the_wrong_shape_are_named(tmp_path: Path, values: np.ndarray):
+    with pytest.raises(ValueError, match="implicit: values"):
+        plot_coverage(tmp_path / "c.png", [Curves("implicit", STEPS, values)], COVERAGE)
+    with pytest.raises(ValueError, match="nothing to draw"):
+        plot_intrinsic_reward(tmp_path / "c.png", [])
+
+
+def test_unwritable_pictures_are_named(tmp_path: Path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RunError, match=r"c\.png"):
+        plot_coverage(tmp_path / "file" / "c.png", [Curves("implicit", STEPS, seeds(1))], COVERAGE)
+
+
+def test_many_groups_are_told_apart_and_named_beside_the_picture(tmp_path: Path, figures: list[Figure]):
+    # ten methods: each line its own colour and dashes, the names outside the axes
+    steps = np.arange(1, 5) * 25
+    curves = [Curves(f"method {i}", steps, np.full((2, 4), i / 10)) for i in range(10)]
+    plot_coverage(tmp_path / "c.png", curves, COVERAGE)
+    check_picture(tmp_path / "c.png", 1500)
+    axes = figures[0].axes[0]
+    bold = [line for line in axes.get_lines() if str(line.get_label()).startswith("method")]
+    assert len({(line.get_color(), line.get_linestyle()) for line in bold}) == 10
+    assert axes.get_legend() is None
+    (legend,) = figures[0].legends
+    assert [text.get_text() for text in legend.get_texts()] == [f"method {i}, 2" for i in range(10)]
+    assert legend.get_title().get_text() == "median, of so many seeds"

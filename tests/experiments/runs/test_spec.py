@@ -1,0 +1,219 @@
+import dataclasses
+import json
+
+import pytest
+
+from experiments.runs import spec
+from experiments.runs.config import PRESETS, RunConfig, differences, flag, replace
+from experiments.runs.presets import preset_config
+from experiments.runs.spec import RunSpec
+from jaxplore.validate import FieldError
+
+# Table "List of SAC hyper-parameters", the appendix on dynamic models, and what nnaisense/max's defaults settle.
+PAPER = {
+    "steps": 10_000,
+    "obs_noise": 0.02,
+    "explorer.warm_up_steps": 256,
+    "explorer.steps_per_round": 25,
+    "explorer.data_capacity": 10_001,
+    "explorer.reward_units": "normalized",
+    "explorer.dynamics.hidden": (512, 512, 512, 512),
+    "explorer.dynamics.activation": "relu",
+    "explorer.generator.noise_size": 32,
+    "explorer.generator.hidden": (64, 64),
+    "explorer.generator.noise": "shared",
+    "explorer.svgd.num_particles": 32,
+    "explorer.svgd.self_weight": 1.0,
+    "explorer.svgd.kernel": "rbf",
+    "explorer.svgd.kernel_outputs": "joint",
+    "explorer.svgd.bandwidth": "median",
+    "explorer.svgd.bandwidth_scale": 1.0,
+    "explorer.svgd.likelihood_std": pytest.approx(0.5**0.5),
+    "explorer.svgd.learn_likelihood_std": False,
+    "explorer.svgd.temperature": 1.0,
+    "explorer.svgd.tempering": "constant",
+    "explorer.svgd.prior": "flat",
+    "explorer.svgd.repulsion_points": "batch",
+    "explorer.svgd.redraw": "every_step",
+    "explorer.fit.lr": 1e-4,
+    "explorer.fit.weight_decay": 1e-5,
+    "explorer.fit.batch_size": 256,
+    "explorer.fit.epochs": 50,
+    "explorer.fit.restart": True,
+    "explorer.fit.clip_value": 5.0,
+    "explorer.fit.clip_norm": 0.0,
+    "explorer.ensemble.num_members": 32,
+    "explorer.reactive.updates": 2_450,
+    "explorer.reactive.restart_every": 1,
+    "explorer.reactive.normalize_reward": False,
+    "explorer.reactive.act_greedily": True,
+    "explorer.imagination.num_actors": 128,
+    "explorer.imagination.horizon": 50,
+    "explorer.imagination.num_rollouts": 50,
+    "explorer.imagination.num_random_rollouts": 3,
+    "explorer.imagination.updates_per_rollout": 50,
+    "explorer.imagination.real_updates": 100,
+    "explorer.imagination.real_fraction": 0.0,
+    "explorer.imagination.current_fraction": 1.0,
+    "explorer.imagination.mover": "per_step",
+    "explorer.imagination.bound": 0.0,
+    "explorer.imagination.replay_capacity": 320_000,
+    "explorer.imagination.restart_every": 1,
+    "explorer.imagination.normalize_reward": False,
+    "explorer.imagination.act_greedily": True,
+    "explorer.sac.hidden": (256, 256),
+    "explorer.sac.activation": "leaky_relu",
+    "explorer.sac.init": "orthogonal",
+    "explorer.sac.lr": 1e-3,
+    "explorer.sac.batch_size": 4096,
+    "explorer.sac.alpha": 0.02,
+    "explorer.sac.discount": 0.99,
+    "explorer.sac.tau": 5e-3,
+    "explorer.sac.reward_scale": 1.0,
+    "explorer.sac.log_std_min": -20.0,
+    "explorer.sac.log_std_max": 2.0,
+    "explorer.sac.policy_penalty": 1e-3,
+    "explorer.sac.grad_clip": 5.0,
+}
+
+
+def to_json(config: RunConfig) -> str:
+    return spec.to_json(RunSpec(config))
+
+
+def from_json(text: str, source: str) -> RunConfig:
+    return spec.from_json(text, source).config
+
+
+def look_up(config, path):
+    for name in path.split("."):
+        config = getattr(config, name)
+    return config
+
+
+@pytest.mark.parametrize("path", PAPER)
+def test_the_paper_preset_is_the_paper(path: str):
+    assert look_up(preset_config("paper"), path) == PAPER[path]
+
+
+def test_the_laptop_preset_takes_10000_steps_of_the_same_size():
+    laptop, paper = preset_config("laptop"), preset_config("paper")
+    assert laptop.steps == 10_000
+    for path in ("explorer.warm_up_steps", "explorer.steps_per_round", "explorer.svgd.num_particles"):
+        assert look_up(laptop, path) == look_up(paper, path)
+    assert laptop.preset == "laptop"
+    assert RunConfig().preset == "laptop"
+
+
+def test_the_smoke_preset_is_smaller_in_everything_that_costs():
+    smoke, laptop = preset_config("smoke"), preset_config("laptop")
+    for path in ("steps", "explorer.fit.steps", "explorer.imagination.horizon", "explorer.imagination.num_actors"):
+        assert look_up(smoke, path) < look_up(laptop, path)
+    assert smoke.steps > smoke.explorer.warm_up_steps + 10 * smoke.explorer.steps_per_round
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_json_and_back(preset: str):
+    config = preset_config(preset)
+    assert from_json(to_json(config), "config.json") == config
+    changed = dataclasses.replace(config, seed=7, obs_noise=0.5)
+    assert from_json(to_json(changed), "config.json") == changed
+
+
+def test_what_json_leaves_out_comes_from_its_preset():
+    config = from_json('{"preset": "smoke", "explorer": {"sac": {"lr": 1, "hidden": [3]}}}', "c")
+    assert config == dataclasses.replace(
+        preset_config("smoke"),
+        explorer=dataclasses.replace(
+            preset_config("smoke").explorer,
+            sac=dataclasses.replace(preset_config("smoke").explorer.sac, lr=1.0, hidden=(3,)),
+        ),
+    )
+    assert isinstance(config.explorer.sac.lr, float)
+    assert from_json("{}", "c") == preset_config("laptop")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", r"c\.json is not JSON"),
+        ("[]", r"c\.json holds list"),
+        ('{"sead": 1}', r"c\.json: field='sead' is not known. Did you mean 'seed'\? Allowed: .*steps"),
+        ('{"explorer": {"sac": {"lrr": 1}}}', r"'explorer\.sac\.lrr' is not known\. Did you mean 'explorer\.sac\.lr'"),
+        ('{"explorer": 3}', r"c\.json: explorer=3\. Allowed: an object"),
+        ('{"seed": "1"}', r"c\.json: seed='1'\. Allowed: a value of type int"),
+        ('{"seed": true}', r"c\.json: seed=True\. Allowed: a value of type int"),
+        ('{"seed": 1.5}', r"c\.json: seed=1\.5\. Allowed: a value of type int"),
+        ('{"seed": -1}', r"c\.json: seed=-1 is out of range\. Allowed: a whole number, 0 or more"),
+        ('{"obs_noise": true}', r"c\.json: obs_noise=True\. Allowed: a value of type float"),
+        ('{"obs_noise": NaN}', r"c\.json: obs_noise=nan is out of range"),
+        ('{"explorer": {"fit": {"restart": 1}}}', r"c\.json: explorer\.fit\.restart=1\. Allowed: a value of type bool"),
+        ('{"explorer": {"sac": {"hidden": 8}}}', r"c\.json: explorer\.sac\.hidden=8\. Allowed: a value of type tuple"),
+        ('{"explorer": {"sac": {"hidden": [8.5]}}}', r"c\.json: explorer\.sac\.hidden=8\.5 is out of range"),
+        ('{"explorer": {"sac": {"hidden": []}}}', r"c\.json: explorer\.sac\.hidden=\(\) is not a list of layer widths"),
+        ('{"explorer": {"sac": {"lr": 0}}}', r"c\.json: explorer\.sac\.lr=0\.0 .*Allowed: a finite number in \(0, inf"),
+        (
+            '{"explorer": {"sac": {"discount": 2}}}',
+            r"explorer\.sac\.discount=2\.0 .*Allowed: a finite number in \[0, 1",
+        ),
+        ('{"env": "ant_mase"}', r"c\.json: env='ant_mase' is not known\. Did you mean 'ant_maze'"),
+        (
+            '{"preset": "papre"}',
+            r"c\.json: preset='papre' is not known\. Did you mean 'paper'\? Allowed: laptop, paper",
+        ),
+        ('{"preset": null}', r"c\.json: preset=None is not known\. Allowed: laptop, paper"),
+        ('{"method": "implict"}', r"c\.json: method='implict' is not known\. Did you mean 'implicit'"),
+        ('{"steps": 10}', r"c\.json: steps=10 ends within the random steps .*Allowed: at least warm_up_steps=256"),
+    ],
+)
+def test_bad_json_is_refused_with_its_place(text: str, message: str):
+    with pytest.raises(ValueError, match=message):
+        from_json(text, "c.json")
+
+
+def spelled(config: RunConfig, changes: dict) -> None:
+    """Change a configuration as the command line does."""
+    try:
+        replace(config, changes)
+    except FieldError as error:
+        raise ValueError(error.spell(flag(error.field))) from error
+
+
+def test_a_message_spells_a_field_as_its_flag():
+    assert flag("explorer.sac.batch_size") == "--sac.batch-size"
+    assert flag("num_seeds") == "--num-seeds"
+    with pytest.raises(ValueError, match=r"^--sac\.batch-size=0 is out of range\. Allowed: a whole number, 1 or more"):
+        spelled(RunConfig(), {"explorer": {"sac": {"batch_size": 0}}})
+    with pytest.raises(ValueError, match=r"^--svgd\.self-weight=0\.5 diverges with redraw='fixed'"):
+        spelled(RunConfig(), {"explorer": {"svgd": {"self_weight": 0.5, "redraw": "fixed"}}})
+
+
+def test_differences_are_named_as_flags_are():
+    saved = preset_config("laptop")
+    assert differences(saved, saved) == []
+    wanted = replace(saved, {"seed": 3, "explorer": {"warm_up_steps": 9, "sac": {"hidden": [8]}}})
+    assert differences(saved, wanted) == [
+        "seed: 0 -> 3",
+        "warm_up_steps: 256 -> 9",
+        "sac.hidden: (128, 128) -> (8,)",
+    ]
+
+
+def test_a_saved_configuration_names_every_field():
+    def paths(value, prefix=""):
+        if not dataclasses.is_dataclass(value):
+            return {prefix}
+        return {
+            path
+            for item in dataclasses.fields(value)
+            for path in paths(getattr(value, item.name), f"{prefix}.{item.name}")
+        }
+
+    def keys(value, prefix=""):
+        if not isinstance(value, dict):
+            return {prefix}
+        return {path for name, inner in value.items() for path in keys(inner, f"{prefix}.{name}")}
+
+    saved = json.loads(to_json(RunConfig()))
+    assert {saved.pop("format"), saved.pop("parent")} == {1, None} and len(saved.pop("identity")) == 16
+    assert keys(saved) == paths(RunConfig())
