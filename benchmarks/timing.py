@@ -39,6 +39,17 @@ def measure(call: Callable[[], Any], *, repeats: int = 5, inner: int = 1) -> Tim
     return Timing(times[0], times[len(times) // 2], compiled)
 
 
+def measure_chain(call: Callable[[Any], Any], state: Any, *, repeats: int = 5, inner: int = 1) -> Timing:
+    """`measure` of a function that takes its state over and gives it back, each call from where the last one ended."""
+
+    def once() -> Any:
+        nonlocal state
+        state = call(state)
+        return state
+
+    return measure(once, repeats=repeats, inner=inner)
+
+
 def matmul_rate() -> float:
     """FLOP/s of a square float32 matrix product on the default device, at JAX's default precision."""
     matrix = jax.random.normal(jax.random.key(0), (MATMUL_SIZE, MATMUL_SIZE))

@@ -1,7 +1,7 @@
 """The chain: a long row of states, where half of them exchange the two actions (Ratzlaff et al. 2020, section 4).
 
 An agent starts near one end and must take 38 steps in one direction to see the other, within an episode of 49. In each
-*flip-state* forward and backward are exchanged, so nothing but trying tells which action leads on: a walk that does
+*flip-state* forward and backward are exchanged, so only trying shows which action leads on: a walk that does
 not know it is a fair random walk.
 
 The paper changes Gymnasium's old NChain, whose backward action jumps to the first state and whose actions slip.

@@ -55,7 +55,7 @@ def write(run: Path, until: int | None = None) -> str:
     )
     shares = {one["seed"]: one["unseen_told_from_data"] for one in seeds}
     told_apart = [
-        f"seed {seed}: variance tells cells not seen from its data {share:.0%} of the time"
+        f"seed {seed}: variance is higher in unseen cells than on its data {share:.0%} of the time"
         for seed, share in shares.items()
         if share is not None
     ]

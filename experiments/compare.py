@@ -1,6 +1,6 @@
 """`python -m experiments.compare [NAME=]RUN ... --out=DIR`: methods side by side, over the seeds of all their runs.
 
-Runs of one method with different settings are told apart by a name of your own in front: `"hot=runs/a"`.
+Runs of one method with different settings are kept apart by a name of your own in front: `"hot=runs/a"`.
 """
 
 import argparse

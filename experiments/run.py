@@ -86,14 +86,14 @@ def parse(argv: Sequence[str]) -> tuple[CommandLine, RunSpec]:
     command, changes = flags.parse(
         argv, (CommandLine(), start.config), prog=PROGRAM, description=description, layout=layout
     )
-    command = {name: value or None if name in ("out", "config", "parent") else value for name, value in command.items()}
+    words = {name: command[name] or None for name in ("out", "config", "parent")}
     try:
-        ref = RunRef.parse(command["parent"]) if command["parent"] else start.parent
+        ref = RunRef.parse(words["parent"]) if words["parent"] else start.parent
         config: RunConfig = replace(start.config, changes)
         check_read(argv, config)
     except FieldError as error:
         raise ValueError(error.spell(flag(error.field))) from error
-    return CommandLine(**command), RunSpec(config, ref)
+    return CommandLine(**{**command, **words}), RunSpec(config, ref)
 
 
 def _start(argv: Sequence[str]) -> RunSpec:
@@ -240,9 +240,8 @@ def prepare(spec: RunSpec, *, resume: bool) -> tuple[Environment, Explorer, RunS
             spec = dataclasses.replace(spec, parent=parent.resolve(spec.parent, env, agent))
         return env, agent, spec
     except FieldError as error:
-        path = path_of(spec.config, error)
-        known = path != error.field or error.field == "parent"
-        raise ValueError(error.spell(flag(path)) if known else str(error)) from error
+        path = "parent" if error.field == "parent" else path_of(spec.config, error)
+        raise ValueError(error.spell(flag(path)) if path else str(error)) from error
 
 
 def carry_out(spec: RunSpec, directory: RunDirectory, env: Environment, agent: Explorer, *, resume: bool) -> int:

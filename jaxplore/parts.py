@@ -5,7 +5,7 @@ not ignored.
 """
 
 import dataclasses
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import Any
 
 from jaxplore.behaviours.base import Behaviour
@@ -40,8 +40,7 @@ def reads(*fields: Any) -> Callable[[Any], Any]:
     Returns:
         A decorator; the part then has `reads(config) -> names`.
     """
-    names: Callable[[ExplorationConfig], Collection[str]]
-    names = fields[0] if fields and callable(fields[0]) else lambda config: set(fields)
+    names: Any = fields[0] if fields and callable(fields[0]) else lambda config: set(fields)
 
     def mark(part: Any) -> Any:
         part.reads = names
@@ -150,7 +149,7 @@ def sac_in_imagination(sizes: Sizes, config: ExplorationConfig, belief: Belief, 
 
 @reads("reactive", "sac")
 def sac_on_real_data(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
-    """SAC on real transitions, labelled anew in each round; nothing is imagined."""
+    """SAC on real transitions, relabelled in each round; nothing is imagined."""
     sac = make_sac(sizes.obs, sizes.action, config.sac)
     return make_reactive(belief, score, sac, sizes.obs, sizes.action, config.reactive)
 
@@ -204,7 +203,7 @@ def distillation_with_sac(sizes: Sizes, config: ExplorationConfig, belief: Belie
 
 
 def _check_replay_keeps_a_round(config: ExplorationConfig) -> None:
-    """What came last is told by where the replay writes, which must not come round within a round."""
+    """What came last follows from where the replay writes, which must not wrap around within a round."""
     if config.data_capacity <= config.steps_per_round:
         allowed = f"at least steps_per_round + 1 = {config.steps_per_round + 1}"
         problem = "holds no more than a round"

@@ -3,7 +3,9 @@
 Warnings are errors too; `pyproject.toml` says so, and which of other packages' warnings are let through.
 """
 
+import gc
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 # Read by JAX when it is imported, and inherited by the commands that tests start.
@@ -23,6 +25,16 @@ import experiments  # noqa: F401  (sets switches of JAX's for the tests of the l
 # Not through the environment: a command under test should see the devices that a user's command sees.
 jax.config.update("jax_num_cpu_devices", 2)
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _forget() -> Iterator[None]:
+    """Take what a file leaves behind out of Python's garbage collection.
+
+    JAX keeps every traced program, gigabytes of Python objects by the end, and each full collection walks all of them.
+    """
+    yield
+    gc.freeze()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -33,9 +33,10 @@ def section(title: str) -> str:
 
 
 def first_column(text: str) -> list[str]:
-    """The names in backticks in the first column of a section's tables."""
-    rows = [row.split("|")[1] for row in text.splitlines() if row.startswith("| `")]
-    return re.findall(r"`([^`]+)`", " ".join(rows))
+    """The names in backticks in the first column of a section's tables, heads left out."""
+    lines = text.splitlines()
+    rows = [row for row, after in zip(lines, [*lines[1:], ""], strict=True) if not after.startswith("| ---")]
+    return re.findall(r"`([^`]+)`", " ".join(row.split("|")[1] for row in rows if row.startswith("| `")))
 
 
 def test_it_is_short():

@@ -301,7 +301,7 @@ def _make(env_id: str, **options: Any) -> gymnasium.Env:
 
 
 def _keep_divergence(env: gymnasium.Env) -> None:
-    """Has MuJoCo leave a diverged state as it is, for `terminated` to tell, and not reset it within an episode."""
+    """Has MuJoCo leave a diverged state as it is, reported by `terminated`, and not reset it within an episode."""
     model: Any = getattr(env.unwrapped, "model", None)
     if type(model).__name__ == "MjModel":
         import mujoco

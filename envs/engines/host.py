@@ -149,7 +149,7 @@ def _noisy(host: Host, key: Key, obs: np.ndarray) -> tuple[Key, np.ndarray]:
 
 def _observe(host: Host, before: Any, after: Any) -> np.ndarray:
     physics = host.physics
-    with np.errstate(over="ignore", invalid="ignore"):  # A diverged state is for `terminated` to tell.
+    with np.errstate(over="ignore", invalid="ignore"):  # A diverged state is reported by `terminated`.
         obs = host.task.observe(np, physics.qpos(before), physics.qpos(after), physics.qvel(after))
         return obs.astype(np.float32)
 

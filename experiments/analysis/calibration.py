@@ -68,7 +68,7 @@ def calibration(judged: Judged) -> Calibration | None:
 
 
 def told_apart(low: np.ndarray, high: np.ndarray) -> float | None:
-    """How often a value of `high` is above one of `low`, ties half: 1 tells all apart, 0.5 none (the area under the
+    """How often a value of `high` is above one of `low`, ties half: 1 separates all, 0.5 none (the area under the
     receiver's curve). None where either has fewer than `FEWEST` values.
     """
     if min(len(low), len(high)) < FEWEST:

@@ -19,7 +19,7 @@ MEASURES = (
     *("intrinsic_reward", "intrinsic_reward_p95", "policy/imagined_reward", "policy/imagined_reward_p95"),
     *("variance", "variance_p95", "divergence", "divergence_p95", "model_error"),
 )
-"""Fields of a run's rows that tell of its belief, on the transitions just met and not learned from yet."""
+"""Fields of a run's rows about its belief, on the transitions just met and not learned from yet."""
 
 
 class Outcome(NamedTuple):

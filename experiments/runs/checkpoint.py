@@ -10,8 +10,8 @@ A checkpoint is a directory named by its step. Orbax writes the arrays, we write
 
 It is prepared as `saving-9000`, flushed to the disk, and then renamed: the rename is the one instant at which the
 checkpoint comes to be, so a process killed at any other instant leaves a directory that is not a checkpoint. Older ones
-go only after it. Orbax does not notice every damaged byte, hence the checksums: nothing is restored whose bytes differ
-from those saved.
+are removed only after it. Orbax does not notice every damaged byte, hence the checksums: nothing is restored whose
+bytes differ from those saved.
 """
 
 import hashlib
@@ -111,7 +111,7 @@ class Checkpoints:
             sync(self.directory)
         except Exception as error:  # Orbax and TensorStore wrap the system's errors in errors of many types.
             shutil.rmtree(staging, ignore_errors=True)
-            then = "go on with --resume" if self.steps() else "start the run again"
+            then = "continue with --resume" if self.steps() else "start the run again"
             raise disk_error(f"write the checkpoint of step {step}", self.directory, error, then) from error
         try:
             for old in self.steps()[: -self._keep]:
@@ -147,7 +147,7 @@ class Checkpoints:
                 reasons.append(f"the checkpoint of step {step} is damaged ({damage})")
                 continue
             for reason in reasons:
-                self._warn(f"{reason}; going on from the one of step {step}")
+                self._warn(f"{reason}; continuing from the one of step {step}")
             try:
                 state = decode(abstract_state, manifest["leaves"], arrays, newer or {})
             except Misfit as misfit:

@@ -25,7 +25,7 @@ def encode(state: Any) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]
     """Splits a state into arrays for Orbax and, for every leaf, a JSON record of what it was.
 
     Everything goes through Orbax as NumPy arrays: it would canonicalise float64 where x64 is off, and refuses arrays
-    without entries (MJX has many); those are made anew from their record.
+    without entries (MJX has many); those are rebuilt from their record.
     """
     arrays: dict[str, np.ndarray] = {}
     records: dict[str, dict[str, Any]] = {}

@@ -119,8 +119,8 @@ def flag(path: str) -> str:
     return "--" + path.removeprefix("explorer.").replace("_", "-")
 
 
-def path_of(config: RunConfig, error: FieldError) -> str:
-    """The path of the field that an error is about; its own name for it where no configuration in `config` has it.
+def path_of(config: RunConfig, error: FieldError) -> str | None:
+    """The path of the field that an error is about; None where no configuration in `config` has it.
 
     What is refused while the parts of a run are built names the class (`PPOConfig.rollout_steps`), not the path.
     """
@@ -136,7 +136,7 @@ def path_of(config: RunConfig, error: FieldError) -> str:
                 return f"{prefix}{item.name}"
         return None
 
-    return search(config, "") or error.field
+    return search(config, "")
 
 
 def differences(saved: RunConfig, wanted: RunConfig) -> list[str]:

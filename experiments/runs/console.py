@@ -18,7 +18,7 @@ class Progress:
 
     Args:
         total_steps: environment steps of the whole run, each seed's.
-        start_step: steps already done, of a run that goes on.
+        start_step: steps already done, of a run that is resumed.
         num_cells: how many cells there are; coverage is then shown as a count.
         stream: where to write, stderr by default.
         live: whether to draw a bar; by default, whether `stream` is a terminal.

@@ -84,8 +84,9 @@ class RunDirectory:
         try:
             found = Status(json.loads((self.path / OUTCOME).read_text())["status"])
         except FileNotFoundError:
-            # Before there were outcomes the walk was a run's last file; a kept run has neither.
-            last = max((row["step"] for row in self.rows()), default=0) if self.is_kept() or self._has_walk() else 0
+            # Before there were outcomes and scenes the walk was a run's last file; a kept run has neither.
+            is_old = self._has_walk() and not (self.path / SCENE).exists()
+            last = max((row["step"] for row in self.rows()), default=0) if self.is_kept() or is_old else 0
             found = Status.FINISHED if last >= self.config().steps else Status.PARTIAL
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise self._unreadable(OUTCOME, error, "remove it, and finish with --resume") from error

@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 class RunError(Exception):
-    """A run cannot start or go on. The text says what is wrong, where, and what to do about it."""
+    """A run cannot start or continue. The text says what is wrong, where, and what to do about it."""
 
 
 _ADVICE = {
@@ -28,7 +28,7 @@ def disk_error(doing: str, path: str | os.PathLike[str], error: BaseException, t
         doing: what could not be done, such as `"write the checkpoint of step 3000"`.
         path: where.
         error: what was raised. Libraries wrap the system's error in their own; its text is then searched.
-        then: what to do once the disk is in order, such as `"go on with --resume"`.
+        then: what to do once the disk is in order, such as `"continue with --resume"`.
 
     Returns:
         An error whose text names the path, the reason and the remedy.

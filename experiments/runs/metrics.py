@@ -77,7 +77,7 @@ class MetricsLog:
             while text:
                 text = text[os.write(self._file, text) :]
         except OSError as error:
-            raise disk_error("write the metrics", self.path, error, "go on with --resume") from error
+            raise disk_error("write the metrics", self.path, error, "continue with --resume") from error
 
     def sync(self) -> None:
         """Forces the rows onto the disk. Call it before a checkpoint: none may be ahead of its rows after a power cut.
@@ -89,10 +89,10 @@ class MetricsLog:
             if self._file is not None:
                 os.fsync(self._file)
         except OSError as error:
-            raise disk_error("write the metrics", self.path, error, "go on with --resume") from error
+            raise disk_error("write the metrics", self.path, error, "continue with --resume") from error
 
     def truncate_after(self, step: int) -> int:
-        """Cuts the file back to the rows with `row["step"] <= step`, for a run that goes on from a checkpoint.
+        """Cuts the file back to the rows with `row["step"] <= step`, for a run that is resumed from a checkpoint.
 
         A line that was torn by a kill goes too. The file is replaced as a whole: killed half-way, it is the old one.
 
@@ -120,7 +120,7 @@ class MetricsLog:
                     file.flush()
                     os.fsync(file.fileno())
         except OSError as error:
-            raise disk_error("cut back the metrics", self.path, error, "go on with --resume") from error
+            raise disk_error("cut back the metrics", self.path, error, "continue with --resume") from error
         return len(kept)
 
     def close(self) -> None:

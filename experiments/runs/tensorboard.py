@@ -20,7 +20,7 @@ class TensorBoardLog:
     Args:
         directory: where the event files lie.
         num_seeds: how many seeds the rows are of.
-        after_step: of the checkpoint that the run goes on from: events after it are hidden. None for a new run.
+        after_step: of the checkpoint that the run is resumed from: events after it are hidden. None for a new run.
     """
 
     def __init__(self, directory: str | os.PathLike[str], *, num_seeds: int = 1, after_step: int | None = None) -> None:
@@ -80,4 +80,4 @@ class TensorBoardLog:
         try:
             yield
         except OSError as error:
-            raise disk_error("write TensorBoard events", self._directory, error, "go on with --resume") from error
+            raise disk_error("write TensorBoard events", self._directory, error, "continue with --resume") from error

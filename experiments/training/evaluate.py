@@ -62,4 +62,5 @@ def first_episodes(rows: Transition) -> tuple[np.ndarray, np.ndarray]:
     done = rows.terminated | rows.truncated
     # Steps before which no episode has ended.
     first = np.cumsum(done, axis=1) - done == 0
-    return np.sum(np.where(first, rows.reward, 0.0), axis=1, dtype=np.float64), first.sum(axis=1)
+    earned = np.where(first, rows.reward, 0.0).astype(np.float64)
+    return np.asarray(earned.sum(axis=1)), np.asarray(first.sum(axis=1))

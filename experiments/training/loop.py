@@ -208,20 +208,21 @@ class Session:
         raise record.diverged_error(self.directory, names, seeds, span)
 
     def _remember(
-        self, transitions: Transition, valid: np.ndarray, episode_step: np.ndarray, span: tuple[int, int]
+        self, transitions: Transition, valid: Any, episode_step: np.ndarray, span: tuple[int, int]
     ) -> list[dict[str, Any]]:
         """Note in the state, in place, what the seeds that are alive saw and earned; what their rows have of it."""
         state, count = self.state, span[1] - span[0]
         # device_get: NumPy itself would wait for the result with Python's lock held, and hang.
         marked = jax.device_get(self.programs.mark(state.visited, transitions.obs, valid))
         state.visited[state.alive] = marked[state.alive]
-        done = (transitions.terminated | transitions.truncated)[:, :count]
+        rows: Any = transitions
+        done = (rows.terminated | rows.truncated)[:, :count]
         if self.env.floor_plan is not None:
-            positions = transitions.obs[:, :count][..., list(self.env.floor_plan.position)]
+            positions = rows.obs[:, :count][..., list(self.env.floor_plan.position)]
             record.walk(state, positions, record.steps_of_episodes(episode_step, done), span)
         own: list[dict[str, Any]] = [{"dropped": int(count - kept.sum())} for kept in valid]
         if self.env.spec.has_reward:
-            for row, ended in zip(own, record.episodes(state, transitions.reward[:, :count], done), strict=True):
+            for row, ended in zip(own, record.episodes(state, rows.reward[:, :count], done), strict=True):
                 row.update(record.earned(ended))
         return own
 

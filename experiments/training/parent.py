@@ -82,4 +82,4 @@ def adopt(state: RunState, ref: RunRef, agent: Explorer) -> RunState:
         return jnp.asarray(leaf)[index]
 
     parents = jax.tree.map(pick, parent_state.explorer)
-    return state.replace(explorer=jax.jit(jax.vmap(one))(state.explorer, parents))
+    return dataclasses.replace(state, explorer=jax.jit(jax.vmap(one))(state.explorer, parents))

@@ -62,7 +62,7 @@ class GradientPolicyConfig:
     grad_clip: float = 5.0
     """Bound on each entry of a gradient, as SAC's."""
     restart: bool = True
-    """Whether each round starts from a new policy or goes on with the last one."""
+    """Whether each round starts from a new policy or continues with the last one."""
     normalize_reward: bool = False
     """Whether rewards are divided by their mean size over the batch, so that the penalty's weight does not depend on
     it."""

@@ -152,7 +152,7 @@ def make_model_free(
 ) -> Behaviour:
     """Train a learner on the real transitions and the environment's own reward: no belief, no intrinsic reward.
 
-    The learner lives as long as the run; each round goes on from where the last one stopped, on batches drawn from all
+    The learner lives as long as the run; each round continues where the last one stopped, on batches drawn from all
     real data.
 
     Args:

@@ -33,7 +33,7 @@ class FitConfig:
     steps: int = 60
     """Gradient steps per round where `epochs` is 0."""
     restart: bool = True
-    """Whether each round starts from new parameters (nnaisense/max) or goes on from the last ones."""
+    """Whether each round starts from new parameters (nnaisense/max) or continues from the last ones."""
     clip_value: float = 5.0
     """Bound on each entry of a gradient (nnaisense/max: 5). 0: none."""
     clip_norm: float = 0.0

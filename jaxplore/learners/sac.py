@@ -144,7 +144,7 @@ def init(networks: SACNetworks, key: Key) -> SACState:
 
 def adopt(state: SACState, actor: Params) -> SACState:
     """The state with another's policy, and critics, their slow copy and the optimiser as they are."""
-    return state.replace(params={**state.params, "policy": actor})
+    return SACState({**state.params, "policy": actor}, state.target_v, state.opt_state)
 
 
 def get_actor(state: SACState) -> Params:

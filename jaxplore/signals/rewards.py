@@ -48,7 +48,7 @@ def jensen_renyi(prediction: Prediction, decay: float = 0.1) -> Array:
         -log (1/m^2) sum_ij N(f_i - f_j; 0, V_i + V_j)  -  (1/m) sum_i (log |4 pi V_i|) / 2
 
     nnaisense/max first moves each variance v towards the largest that a network can state, to
-    `MAX_VAR - decay (MAX_VAR - v)`: with its decay of 0.1 the divergence tells hardly anything but how far the means
+    `MAX_VAR - decay (MAX_VAR - v)`: with its decay of 0.1 the divergence says little but how far the means
     lie apart, and is about 1.4 times `variance` where that is small.
 
     Args:

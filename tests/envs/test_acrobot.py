@@ -226,7 +226,7 @@ def test_the_picture_shows_where_the_links_are(env):
     ("options", "message"),
     [
         ({"backend": "mjx"}, "backend='mjx' is not known.*Allowed: auto, jax"),
-        ({"obs_noise": -0.1}, "obs_noise is -0.1"),
+        ({"obs_noise": -0.1}, r"obs_noise=-0\.1 is out of range"),
         ({"horizontal": 1.5}, r"horizontal=1\.5 is out of range\. Allowed: a finite number in \(0, 1\]"),
         ({"horizontal": 0.0}, r"horizontal=0\.0 is out of range"),
     ],

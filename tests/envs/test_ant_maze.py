@@ -4,9 +4,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from envs import ant_maze, coverage, host_backend
+from envs import ant_maze, coverage
 from envs.ant_maze import SIDES, SPEC, WALLS, make_ant_maze, make_model
 from envs.base import EnvState
+from envs.engines import host as host_engine
 
 CENTRES = np.array([(0, 0), (2, 0), (4, 0), (4, 2), (4, 4), (2, 4), (0, 4)], float)
 BLOCKS = [(x, y) for x in (-2, 0, 2, 4, 6) for y in (-2, 0, 2, 4, 6)]
@@ -28,6 +29,12 @@ def host():
 @pytest.fixture(scope="module")
 def device():
     return make_ant_maze("mjx")
+
+
+@pytest.fixture(scope="module")
+def starts():
+    """qpos `[4000, 15]` and qvel `[4000, 14]` of that many starts."""
+    return jax.device_get(jax.jit(jax.vmap(ant_maze.start))(jax.random.split(jax.random.key(0), 4000)))
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +71,7 @@ def device_states(device, states):
 def contacts(model, state):
     """MuJoCo's data with the contacts of a host state."""
     data = mujoco.MjData(model)
-    mujoco.mj_setState(model, data, state.physics, host_backend.STATE)
+    mujoco.mj_setState(model, data, state.physics, host_engine.STATE)
     mujoco.mj_forward(model, data)
     return data
 
@@ -116,7 +123,7 @@ class TestModel:
     def test_fewer_solver_iterations_change_no_bit(self, host):
         full = make_model()
         full.opt.iterations, full.opt.ls_iterations = 100, 50
-        physics = host_backend.make_physics(full, 5)
+        physics = host_engine.make_physics(full, 5)
         state, rng = host.reset(jax.random.key(0)), np.random.default_rng(0)
         for _ in range(300):
             action = rng.uniform(-1, 1, 8).astype(np.float32)
@@ -203,15 +210,16 @@ class TestWalls:
         angle = rng.uniform(0, 2 * np.pi)
         qvel[:2] = 10 * np.cos(angle), 10 * np.sin(angle)
         (state,) = host_states(host, [qpos], [qvel])
-        ant = model.geom_bodyid != 0
+        ant, seen = model.geom_bodyid != 0, []
         for _ in range(300):
             state, transition = host.step(state, np.sign(rng.uniform(-1, 1, 8)))
-            assert host.coverage.cell(jnp.asarray(transition.next_obs)) >= 0
+            seen.append(transition.next_obs)
             data = contacts(model, state)
             # The axis of no part is inside a wall; parts are at least 0.08 m thick.
             assert np.all((data.geom_xpos[ant, :2] > -1) & (data.geom_xpos[ant, :2] < 5))
             assert data.contact.dist.min(initial=0) > -0.16
             assert 0 < transition.next_obs[4] < 6
+        assert (jax.vmap(host.coverage.cell)(jnp.stack(seen)) >= 0).all()
         assert not transition.terminated
 
 
@@ -232,9 +240,9 @@ class TestObservation:
             np.testing.assert_array_equal(transition.next_obs, state.obs)
             assert transition.reward == 0
 
-    def test_every_episode_begins_in_the_start_cell(self, host):
-        starts = jax.vmap(ant_maze.start)(jax.random.split(jax.random.key(0), 500))[0]
-        obs = jnp.zeros((500, 31)).at[:, 2:4].set(starts[:, :2])
+    def test_every_episode_begins_in_the_start_cell(self, host, starts):
+        obs = np.zeros((len(starts[0]), 31), np.float32)
+        obs[:, 2:4] = starts[0][:, :2]
         visited = coverage.update_from_obs(host.coverage, coverage.init(host.coverage), obs)
         np.testing.assert_array_equal(visited, [True] + [False] * 6)
 
@@ -254,8 +262,8 @@ class TestReset:
             np.testing.assert_allclose(on_device.physics.qvel, on_host.physics[16:30], rtol=0, atol=1e-7)
             assert on_host.num_steps == on_device.num_steps == 0
 
-    def test_distribution(self):
-        qpos, qvel = jax.vmap(ant_maze.start)(jax.random.split(jax.random.key(0), 4000))
+    def test_distribution(self, starts):
+        qpos, qvel = starts
         # Positions and joints are uniform in 0.1 around qpos0, deviation 0.1 / sqrt(3); standard errors below 0.001.
         rest = np.array([0, 0, 0.75, *[0] * 8])
         free = np.delete(np.asarray(qpos), np.s_[3:7], axis=1) - rest
@@ -289,29 +297,29 @@ class TestEpisode:
         assert not transitions.terminated.any()
         np.testing.assert_array_equal(states.num_steps, np.arange(296, 304))
 
-    def test_a_saved_host_state_goes_on_to_the_bit(self, host):
+    def test_a_saved_host_state_continues_to_the_bit(self, host):
         state, rng = host.reset(jax.random.key(0)), np.random.default_rng(0)
         actions = rng.uniform(-1, 1, (60, 8))
         for action in actions[:30]:
             state, _ = host.step(state, action)
         saved, frozen = state, state.physics.copy()
 
-        def go_on(env, state):
+        def follow(env, state):
             steps = []
             for action in actions[30:]:
                 state, transition = env.step(state, action)
                 steps.append(transition.next_obs)
             return np.array(steps), state.physics
 
-        first = go_on(host, saved)
+        first = follow(host, saved)
         for i in range(40):  # elsewhere, so that what is left in the engine differs
             host.step(host.reset(jax.random.key(i)), actions[i])
         for env in (host, make_ant_maze("mujoco")):
-            for a, b in zip(first, go_on(env, saved), strict=True):
+            for a, b in zip(first, follow(env, saved), strict=True):
                 np.testing.assert_array_equal(a, b)
         np.testing.assert_array_equal(saved.physics, frozen)
 
-    def test_a_saved_device_state_goes_on_to_the_bit(self, device, device_step):
+    def test_a_saved_device_state_continues_to_the_bit(self, device, device_step):
         states = jax.vmap(device.reset)(jax.random.split(jax.random.key(0), BATCH))
         actions = np.random.default_rng(0).uniform(-1, 1, (12, BATCH, 8)).astype(np.float32)
         for action in actions[:6]:
@@ -384,7 +392,7 @@ class TestOptions:
 
     @pytest.mark.parametrize("value", [-1.0, float("nan")])
     def test_bad_noise(self, value):
-        with pytest.raises(ValueError, match="obs_noise is"):
+        with pytest.raises(ValueError, match=r"obs_noise=.* is out of range"):
             make_ant_maze("mujoco", obs_noise=value)
 
     def test_bad_action(self, host):

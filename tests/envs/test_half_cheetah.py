@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import envs
-from envs import half_cheetah, host_backend
+from envs import half_cheetah
+from envs.engines import host as host_engine
 from envs.half_cheetah import DT, GEARS, SPEC, TASK_SPEC, make_half_cheetah, make_half_cheetah_task, make_model
 
 BATCH = 8
@@ -68,7 +69,7 @@ class TestModel:
     def test_fewer_solver_iterations_change_no_bit_and_contacts_are_few(self, host, model):
         full = make_model()
         full.opt.iterations, full.opt.ls_iterations = 100, 50
-        physics, data = host_backend.make_physics(full, 5), mujoco.MjData(model)
+        physics, data = host_engine.make_physics(full, 5), mujoco.MjData(model)
         rng = np.random.default_rng(0)
         for _ in range(10):
             # On its feet, on its back, thrown.
@@ -79,7 +80,7 @@ class TestModel:
                 expected = physics.step(state.physics, action)
                 state, _ = host.step(state, action)
                 np.testing.assert_array_equal(state.physics, expected)
-                mujoco.mj_setState(model, data, state.physics, host_backend.STATE)
+                mujoco.mj_setState(model, data, state.physics, host_engine.STATE)
                 mujoco.mj_forward(model, data)
                 assert data.ncon <= half_cheetah.MAX_CONTACTS
 

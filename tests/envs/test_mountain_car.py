@@ -175,7 +175,10 @@ def test_shapes_are_those_of_the_spec(env, step):
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"backend": "mujoco"}, "backend='mujoco' is not known.*Allowed: auto, jax"), ({"obs_noise": -1}, "obs_noise is")],
+    [
+        ({"backend": "mujoco"}, "backend='mujoco' is not known.*Allowed: auto, jax"),
+        ({"obs_noise": -1}, "obs_noise=-1 is"),
+    ],
 )
 def test_bad_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):

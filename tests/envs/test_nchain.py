@@ -9,8 +9,8 @@ import envs
 from envs import coverage
 from envs.nchain import flip_states, make_nchain
 from envs.stepper import make_collect
-from experiments import loop
 from experiments.runs.config import RunConfig
+from experiments.training.build import make_env
 
 N = 40
 FORWARD, BACKWARD = np.eye(2, dtype=np.float32)
@@ -97,7 +97,7 @@ def test_coverage_of_a_scripted_walk(chain):
 def test_a_run_has_the_chain_of_its_seed():
     # the first seed's, whatever the number of seeds
     config = RunConfig(env="nchain", seed=7, num_seeds=2)
-    env = loop.make_environment(config)
+    env = make_env(config)
     for state in range(N):
         moved = int(env.step(at(env, state), jnp.asarray(FORWARD))[0].physics)
         assert moved == successor(flip_states(N, 7), state, 0)

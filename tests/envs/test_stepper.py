@@ -17,19 +17,32 @@ def act(key, obs):
     return 0.5 * jax.random.uniform(key, (1,), minval=-1.0) + 0.1 * jnp.tanh(obs[:1])
 
 
+def pushed(key, actor, obs):
+    """`act`, as strong as the actor is, and to its side."""
+    return actor["strength"] * act(key, obs) + 0.1 * actor["side"]
+
+
+SEEDS = 3
+ACTORS = {"strength": jnp.array([0.1, 1.0, 2.0]), "side": jnp.array([1.0, 0.0, -1.0])}
+ONE_ACTOR = {"strength": jnp.float32(1.0), "side": jnp.float32(0.0)}
+"""Acts as `act` does."""
+
+
 @functools.cache
 def program(env):
-    """`(key, reset_key, num_steps) -> (state, transitions [ROWS], valid [ROWS])`: one program where `env` allows."""
-    collect = make_collect(env, ROWS)
-    if env.compiled:
-        return jax.jit(lambda key, reset_key, num_steps: collect(key, env.reset(reset_key), act, num_steps))
-    return lambda key, reset_key, num_steps: collect(key, env.reset(reset_key), jax.jit(act), num_steps)
+    """`(key, state, actor, num_steps) -> (state, transitions [ROWS], valid [ROWS])`: one program where `env` allows."""
+    collect, as_actor = make_collect(env, ROWS), jax.jit(pushed)
+
+    def run(key, state, actor, num_steps):
+        return collect(key, state, lambda act_key, obs: as_actor(act_key, actor, obs), num_steps)
+
+    return jax.jit(run) if env.compiled else run
 
 
 def collect_with(env, num_steps=ROWS, seed=0):
     """Collects from a fresh episode."""
     reset_key, key = jax.random.split(jax.random.key(seed))
-    state, transitions, valid = program(env)(key, reset_key, num_steps)
+    state, transitions, valid = program(env)(key, prepared(env).reset(reset_key), ONE_ACTOR, num_steps)
     np.testing.assert_array_equal(valid, np.arange(ROWS) < num_steps)
     return state, jax.tree.map(lambda leaf: leaf[:num_steps], transitions)
 
@@ -89,11 +102,12 @@ def test_a_state_that_needs_a_reset_comes_back_reset(make_bead, backend):
 
 
 def test_vmap_is_the_same_as_one_by_one(make_bead):
-    run = program(make_bead("mjx"))
+    env = make_bead("mjx")
     keys, reset_keys = jax.random.split(jax.random.key(3), (2, 3))
-    _, together, _ = jax.vmap(run, in_axes=(0, 0, None))(keys, reset_keys, 9)
+    states = jax.vmap(prepared(env).reset)(reset_keys)
+    _, together, _ = jax.vmap(program(env), in_axes=(0, 0, None, None))(keys, states, ONE_ACTOR, 9)
     for i in range(3):
-        _, alone, _ = run(keys[i], reset_keys[i], 9)
+        _, alone, _ = program(env)(keys[i], prepared(env).reset(reset_keys[i]), ONE_ACTOR, 9)
         np.testing.assert_allclose(together.obs[i], alone.obs, atol=1e-6)
 
 
@@ -165,15 +179,6 @@ def test_refuses_bad_numbers(make_bead):
             make_collect(env, 5)(jax.random.key(0), env.reset(jax.random.key(0)), act, count)
 
 
-SEEDS = 3
-ACTORS = {"strength": jnp.array([0.1, 1.0, 2.0]), "side": jnp.array([1.0, 0.5, -1.0])}
-
-
-def pushed(key, actor, obs):
-    """`act`, as strong as the actor is, and to its side."""
-    return actor["strength"] * act(key, obs) + 0.1 * actor["side"]
-
-
 @pytest.fixture(scope="module", params=BACKENDS)
 def steppers(request, make_bead):
     """A bead with noise, and a stepper of it; episodes are 7 steps."""
@@ -189,12 +194,6 @@ def test_each_seed_of_a_stepper_is_that_seed_alone(steppers):
     env, stepper = steppers
     env_state, alone = stepper.init(seeds(0)), [prepared(env).reset(key) for key in seeds(0)]
     np.testing.assert_allclose(stepper.obs(env_state), [state.obs for state in alone], rtol=0, atol=1e-7)
-    collect, as_actor = make_collect(env, ROWS), jax.jit(pushed)
-
-    def walk(key, state, actor, num_steps):
-        return collect(key, state, lambda act_key, obs: as_actor(act_key, actor, obs), num_steps)
-
-    walk = jax.jit(walk) if env.compiled else walk
     # The second time from where the first one stopped, and for fewer steps.
     for keys, num_steps in ((seeds(1), ROWS), (seeds(2), 5)):
         env_state, rows, valid = stepper.collect(keys, env_state, ACTORS, num_steps)
@@ -202,7 +201,7 @@ def test_each_seed_of_a_stepper_is_that_seed_alone(steppers):
         assert rows.obs.shape == (SEEDS, ROWS, 2)
         for i in range(SEEDS):
             actor = jax.tree.map(lambda leaf, i=i: leaf[i], ACTORS)
-            alone[i], own, _ = walk(keys[i], alone[i], actor, num_steps)
+            alone[i], own, _ = program(env)(keys[i], alone[i], actor, num_steps)
             for together, by_itself in zip(rows, own, strict=True):
                 # On the host to the bit.
                 np.testing.assert_allclose(together[i], by_itself, rtol=0, atol=1e-6 if env.compiled else 0)
@@ -212,9 +211,8 @@ def test_each_seed_of_a_stepper_is_that_seed_alone(steppers):
 
 
 def test_a_stepper_knows_where_it_stands_in_an_episode(steppers):
-    env, stepper = steppers
-    env_state = stepper.init(seeds(0))
-    at = 0
+    _, stepper = steppers
+    env_state, at = stepper.init(seeds(0)), 0
     assert stepper.episode_step(env_state).tolist() == [0] * SEEDS
     for count in (3, 3, 1, 6, 2, 14):  # episodes end with steps 7, 14, 21 and 28
         before = stepper.obs(env_state)

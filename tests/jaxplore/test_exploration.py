@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxplore import rewards
-from jaxplore.behaviours import ImaginationConfig, make_imagination
+from jaxplore import replay, rewards
+from jaxplore.behaviours import Experience, ImaginationConfig, make_imagination
+from jaxplore.behaviours.imagination import mixed_draw, starts
 from jaxplore.beliefs import Belief, FitConfig
 from jaxplore.beliefs.generator import GeneratorConfig
 from jaxplore.beliefs.svgd import SVGDConfig
@@ -83,9 +84,7 @@ def recording(sizes, config, belief, score):
     return make_imagination(belief, score, learner, sizes.obs, sizes.action, config.imagination)
 
 
-def fake_explorer(
-    reward=variance_and_change, fit=None, capacity=64, batch_size=16, belief=counting_belief, **imagination
-):
+def make_fake(reward=variance_and_change, fit=None, capacity=64, batch_size=16, belief=counting_belief, **imagination):
     """An explorer of the fakes above; 3 fit steps and one imagined rollout of 4 actors x 2 steps by default."""
     settings = {
         "num_actors": 4,
@@ -102,8 +101,48 @@ def fake_explorer(
         imagination=ImaginationConfig(**{**settings, **imagination}),
         sac=SACConfig(batch_size=batch_size),
     )
-    explorer = make_explorer(Method("counts", belief, reward, recording), SIZES, config)
-    return explorer._replace(improve=jax.jit(explorer.improve), observe=jax.jit(explorer.observe))
+    return make_explorer(Method("counts", belief, reward, recording), SIZES, config)
+
+
+def jitted(explorer):
+    """With its functions compiled."""
+    names = ("init", "observe", "improve", "assess")
+    return explorer._replace(**{name: jax.jit(getattr(explorer, name)) for name in names})
+
+
+@functools.cache
+def fake_explorer(**settings):
+    """The same for all tests that name the same settings: its programs are compiled once."""
+    return jitted(make_fake(**settings))
+
+
+GOING_ON = {
+    "fit": FitConfig(epochs=0, steps=3, restart=False),
+    "restart_every": 0,
+    "num_rollouts": 2,
+    "normalize_reward": True,
+}
+"""Neither the belief nor the policy starts again, and rewards are divided by their standard deviation."""
+
+RANDOM_AND_REAL = {
+    "restart_every": 2,
+    "num_actors": 64,
+    "horizon": 3,
+    "num_rollouts": 3,
+    "num_random_rollouts": 2,
+    "real_updates": 3,
+    "replay_capacity": 2000,
+}
+"""A policy lives for two rounds, in each of which it has updates on real data and one rollout of its own."""
+
+TAGGED = {
+    "reward": tagged,
+    "fit": FitConfig(epochs=0, steps=1),
+    "num_rollouts": 3,
+    "real_updates": 1,
+    "real_fraction": 0.25,
+}
+"""The reward tells which draw of models it was read off; a quarter of each batch is real."""
 
 
 def transitions(num, seed=0, terminated=False):
@@ -111,11 +150,11 @@ def transitions(num, seed=0, terminated=False):
     obs = rng.normal(size=(num, SIZES.obs)) * [1.0, 2.0, 3.0] + 1
     action = rng.uniform(-1, 1, size=(num, SIZES.action))
     rows = [jnp.asarray(x, jnp.float32) for x in (obs, action, np.zeros(num), obs + 0.5 * rng.normal(size=obs.shape))]
-    return Transition(*rows, jnp.full(num, terminated), jnp.zeros(num, bool))
+    return Transition(*rows, jnp.asarray(np.full(num, terminated)), jnp.asarray(np.zeros(num, bool)))
 
 
 def begin(explorer, num=20, seed=0, **kwargs):
-    return explorer.observe(explorer.init(jax.random.key(seed)), transitions(num, **kwargs), jnp.ones(num, bool))
+    return explorer.observe(explorer.init(jax.random.key(seed)), transitions(num, **kwargs), np.ones(num, bool))
 
 
 def normal(state, rows):
@@ -144,18 +183,19 @@ def test_observe_takes_in_valid_rows_only():
     np.testing.assert_allclose(state.normalizers.action.std, np.asarray(rows.action)[valid].std(axis=0), rtol=1e-4)
 
 
-@pytest.mark.parametrize("restart", [True, False])
-def test_imagined_rewards_come_from_the_models_fitted_in_this_round(restart):
+@pytest.mark.parametrize(("settings", "restart"), [({}, True), (GOING_ON, False)], ids=["restart", "going on"])
+def test_imagined_rewards_come_from_the_models_fitted_in_this_round(settings, restart):
     # Algorithm 1: fit, then sample, then imagine. 3 updates a round: the reward is 1.25 n^2 |obs|^2 + 100 delta_0 with
-    # n = 3 each round after a restart, and n = 3, 6, 9 without
-    explorer = fake_explorer(fit=FitConfig(epochs=0, steps=3, restart=restart))
+    # n = 3 each round after a restart, and n = 3, 6, 9 without; of the last rollout, 8 transitions, the metrics tell
+    explorer = fake_explorer(**settings)
     state = begin(explorer)
     for number in (1, 2, 3):
         state, metrics = explorer.improve(jax.random.key(number), state, OBS, 20)
         n = 3 if restart else 3 * number
         rows = held(state.behaviour.imagined)
+        assert len(rows.reward) == (8 if restart else 16 * number)
+        rows = jax.tree.map(lambda leaf: leaf[-8:], rows)
         obs, delta = normal(state, rows)
-        assert len(rows.reward) == 8
         want = SPREAD * n**2 * np.sum(obs**2, axis=1) + 100 * delta[:, 0]
         np.testing.assert_allclose(rows.reward, want, rtol=1e-3, atol=1e-2)
         assert int(state.belief) == n == int(metrics["fit/updates"])
@@ -166,16 +206,25 @@ def test_imagined_rewards_come_from_the_models_fitted_in_this_round(restart):
 
 def test_one_draw_of_models_serves_the_whole_round():
     # the tag of a draw is the same in all rollouts of a round, and on the real data; another round has another
-    explorer = fake_explorer(tagged, num_rollouts=3, real_updates=1, fit=FitConfig(epochs=0, steps=1))
-    state, tags = begin(explorer), []
+    explorer = fake_explorer(**TAGGED)
+    state, tags = begin(explorer, terminated=True), []
     for number in (1, 2):
         state, _ = explorer.improve(jax.random.key(number), state, OBS, 20)
         # Model 0 predicts 0 obs + tag.
-        imagined = held(state.behaviour.imagined).reward
+        imagined, batch = held(state.behaviour.imagined).reward, state.behaviour.learner["batch"]
         np.testing.assert_allclose(imagined, imagined[0], rtol=1e-6)
         assert len(imagined) == 24
+        assert np.any(batch.terminated)  # Some of its rows are real.
+        np.testing.assert_allclose(batch.reward, imagined[0], rtol=1e-6)
         tags.append(imagined[0])
     assert tags[0] != tags[1]
+
+
+@functools.cache
+def updates_of_a_fit(fit):
+    """`(explorer, program)`: the number of updates that `improve` gives the belief. Nothing else is compiled."""
+    explorer = make_fake(fit=fit)
+    return jitted(explorer), jax.jit(lambda *args: explorer.improve(*args)[0].belief)
 
 
 @pytest.mark.parametrize(
@@ -185,29 +234,34 @@ def test_epochs_set_the_length_of_a_fit(num_data, epochs, want):
     # epochs * max(1, N // 20) steps, or `steps` where epochs is 0; N is the number given, so the program is one
     fit = FitConfig(epochs=epochs, steps=7, batch_size=20)
     assert int(fit.num_steps(jnp.asarray(num_data))) == want
-    explorer = jitted_fake(fit)
-    assert int(explorer.improve(jax.random.key(0), begin(explorer), OBS, num_data)[0].belief) == want
+    explorer, updates = updates_of_a_fit(fit)
+    assert int(updates(jax.random.key(0), begin(explorer), OBS, num_data)) == want
 
 
-jitted_fake = functools.cache(lambda fit: fake_explorer(fit=fit))
-
-
-@pytest.mark.parametrize(("restart_every", "lives"), [(1, [1, 1, 1, 1, 1]), (0, [1, 2, 3, 4, 5]), (2, [1, 2, 1, 2, 1])])
-def test_restart_resets_the_policy_and_its_imagined_data(restart_every, lives):
-    # a life of k rounds has had k * (3 real + 2 * 2 imagined) updates and holds k * 3 rollouts of 8 transitions (one of
-    # the three is random, and trains nothing)
-    explorer = fake_explorer(restart_every=restart_every, num_rollouts=3, num_random_rollouts=1, real_updates=3)
+@pytest.mark.parametrize(
+    ("settings", "updates", "rows", "lives"),
+    [
+        ({}, 2, 8, [1, 1, 1, 1, 1]),
+        (GOING_ON, 2 * 2, 2 * 8, [1, 2, 3, 4, 5]),
+        (RANDOM_AND_REAL, 3 + 2, 3 * 192, [1, 2, 1, 2, 1]),
+    ],
+    ids=["every round", "never", "every second round"],
+)
+def test_restart_resets_the_policy_and_its_imagined_data(settings, updates, rows, lives):
+    # a life of k rounds has had k times a round's updates and holds the transitions of k times its rollouts (of three
+    # rollouts two are random, and train nothing)
+    explorer = fake_explorer(**settings)
     state = begin(explorer)
     for number, k in enumerate(lives):
         state, _ = explorer.improve(jax.random.key(number), state, OBS, 20)
-        assert int(state.behaviour.learner["updates"]) == k * 7
-        assert int(state.behaviour.imagined.size) == k * 24
+        assert int(state.behaviour.learner["updates"]) == k * updates
+        assert int(state.behaviour.imagined.size) == k * rows
 
 
 def test_first_rollouts_take_uniform_actions():
     # two random rollouts of 64 actors (768 numbers: mean 0 +- 0.02, variance 1/3 +- 0.011), then the policy's,
     # which sees normalised observations
-    explorer = fake_explorer(num_actors=64, horizon=3, num_rollouts=3, num_random_rollouts=2, replay_capacity=1000)
+    explorer = fake_explorer(**RANDOM_AND_REAL)
     state, _ = explorer.improve(jax.random.key(0), begin(explorer), OBS, 20)
     rows = held(state.behaviour.imagined)
     actions = rows.action
@@ -241,19 +295,28 @@ def test_real_data_get_the_reward_computed_directly():
     np.testing.assert_array_equal(batch.action, rows.action[index])
 
 
-@pytest.mark.parametrize(("fraction", "want"), [(0.0, 0), (0.25, 4), (1.0, 16)])
-def test_share_of_real_rows_in_a_batch(fraction, want):
+@pytest.mark.parametrize(("settings", "want"), [({}, 0), (TAGGED, 4)], ids=["none", "a quarter"])
+def test_share_of_real_rows_in_a_batch(settings, want):
     # imagined transitions never terminate; here all real ones do, and their actions are below 4
-    explorer = fake_explorer(real_fraction=fraction)
+    explorer = fake_explorer(**settings)
     state, _ = explorer.improve(jax.random.key(0), begin(explorer, terminated=True), OBS, 20)
     batch = state.behaviour.learner["batch"]
     assert int(jnp.sum(batch.terminated)) == want
     assert int(jnp.sum(jnp.all(batch.action > 3.9, axis=1))) == 16 - want
 
 
+@pytest.mark.parametrize(("fraction", "want"), [(0.0, 0), (0.25, 4), (1.0, 16)])
+def test_share_of_real_rows_in_a_draw(fraction, want):
+    # two buffers of numbers: positive ones are real
+    full = jnp.asarray(np.int32(8))
+    real, imagined = (replay.Replay({"x": jnp.asarray(sign * np.arange(1.0, 9))}, 0 * full, full) for sign in (1, -1))
+    draw = mixed_draw(imagined, real, 16, fraction)
+    assert int(jnp.sum(draw(jax.random.key(0))["x"] > 0)) == want
+
+
 def test_rewards_are_divided_by_their_standard_deviation():
     # over the imagined data held, by NumPy; the buffer keeps the reward's own units
-    explorer = fake_explorer(normalize_reward=True, num_rollouts=2, restart_every=0)
+    explorer = fake_explorer(**GOING_ON)
     state = begin(explorer)
     for number in (0, 1):
         state, _ = explorer.improve(jax.random.key(number), state, OBS, 20)
@@ -270,12 +333,12 @@ def test_rewards_are_divided_by_their_standard_deviation():
 @pytest.mark.parametrize(("fraction", "num_current"), [(1.0, 8), (0.25, 2), (0.0, 0)])
 def test_share_of_actors_that_start_where_the_environment_stands(fraction, num_current):
     # round(fraction * 8) actors at the current observation, the others at observations of the data
-    explorer = fake_explorer(num_actors=8, horizon=1, current_fraction=fraction)
-    state, _ = explorer.improve(jax.random.key(0), begin(explorer), OBS, 20)
-    starts, past = held(state.behaviour.imagined).obs, np.asarray(transitions(20).obs)
-    here = np.all(starts == np.asarray(OBS), axis=1)
+    state = begin(fake_explorer())
+    found = starts(jax.random.key(0), Experience((), state.data, jnp.int32(20), state.normalizers, OBS), 8, fraction)
+    found, past = np.asarray(found), np.asarray(transitions(20).obs)
+    here = np.all(found == np.asarray(OBS), axis=1)
     assert here.sum() == num_current
-    assert all(np.any(np.all(past == start, axis=1)) for start in starts[~here])
+    assert all(np.any(np.all(past == start, axis=1)) for start in found[~here])
 
 
 def test_imagined_rows_that_are_not_finite_are_dropped():
@@ -305,13 +368,28 @@ def test_imagined_rows_that_are_not_finite_are_dropped():
 @pytest.mark.parametrize("greedily", [True, False])
 def test_acting_sees_normalised_observations(greedily):
     # the fake's greedy action is what it sees, its drawn one 5 + tanh of it; any leading axes
-    explorer = fake_explorer(act_greedily=greedily)
-    state = begin(explorer)
+    explorer, state = make_fake(act_greedily=greedily), begin(fake_explorer())
     obs = transitions(6, seed=1).obs.reshape(2, 3, SIZES.obs)
     stats = state.normalizers.obs
     seen = (np.asarray(obs) - np.asarray(stats.mean)) / np.asarray(stats.std)
     want = seen[..., : SIZES.action] if greedily else 5 + np.tanh(seen[..., : SIZES.action])
     np.testing.assert_allclose(explorer.act(jax.random.key(0), explorer.actor(state), obs), want, rtol=1e-4, atol=1e-5)
+
+
+def test_an_actor_acts_uniformly_or_as_the_behaviour_does():
+    # uniform: the very numbers of uniform actions with that key, traced or not; otherwise the behaviour's, which here
+    # are above 4
+    explorer, state, key = make_fake(act_greedily=False), begin(fake_explorer()), jax.random.key(4)
+    obs = transitions(6, seed=1).obs
+    uniform = uniform_actions(key, obs, SIZES.action)
+    act = jax.jit(lambda wanted: explorer.act(key, explorer.actor(state, uniform=wanted), obs))
+    np.testing.assert_array_equal(explorer.act(key, explorer.actor(state, uniform=True), obs), uniform)
+    np.testing.assert_array_equal(act(True), uniform)
+    np.testing.assert_array_equal(explorer.act_uniformly(key, obs), uniform)
+    assert np.max(np.abs(uniform)) <= 1
+    seen = normal(state, transitions(6, seed=1))[0][:, : SIZES.action]
+    for actions in (act(False), explorer.act(key, explorer.actor(state), obs)):
+        np.testing.assert_allclose(actions, 5 + np.tanh(seen), rtol=1e-4)
 
 
 def test_assess_says_what_the_belief_makes_of_new_transitions():
@@ -336,14 +414,14 @@ def test_assess_says_what_the_belief_makes_of_new_transitions():
 
 def test_random_method_acts_uniformly_and_learns_nothing():
     # U[-1, 1]: mean 0, variance 1/3 (2,000 numbers); improve returns the state it got, to the bit
-    explorer = make_explorer(METHODS["random"], SIZES, ExplorationConfig(data_capacity=64))
+    explorer = jitted(make_explorer(METHODS["random"], SIZES, ExplorationConfig(data_capacity=64)))
     state = begin(explorer)
-    improved, metrics = explorer.improve(jax.random.key(1), state, OBS, jnp.asarray(20))
+    improved, metrics = explorer.improve(jax.random.key(1), state, OBS, 20)
     assert metrics == {} and explorer.assess(jax.random.key(0), state, transitions(4), jnp.ones(4, bool)) == {}
     assert jax.tree.structure(improved) == jax.tree.structure(state)
     jax.tree.map(np.testing.assert_array_equal, improved, state)
     for draw in (functools.partial(explorer.act, actor=explorer.actor(state)), explorer.act_uniformly):
-        actions = np.asarray(draw(jax.random.key(2), obs=jnp.zeros((1000, 3))))
+        actions = np.asarray(draw(jax.random.key(2), obs=np.zeros((1000, 3), np.float32)))
         assert actions.shape == (1000, 2) and np.max(np.abs(actions)) <= 1
         assert np.mean(actions) == pytest.approx(0, abs=0.06) and np.var(actions) == pytest.approx(1 / 3, abs=0.03)
 
@@ -389,13 +467,13 @@ SMALL = ExplorationConfig(
         restart_every=0,
         replay_capacity=64,
     ),
-    sac=SACConfig(hidden=(8, 8), batch_size=8, init="lecun", log_std_min=-5.0),
+    sac=SACConfig(hidden=(8,), batch_size=8, init="lecun", log_std_min=-5.0),
 )
 
 
 @pytest.fixture(scope="module")
 def small():
-    """The paper's method at small size, `improve` jitted, and how often it was traced."""
+    """The paper's method at small size, compiled; as it is; and how often `improve` was traced."""
     explorer = make_explorer(METHODS["implicit"], SIZES, SMALL)
     traces = []
 
@@ -403,16 +481,15 @@ def small():
         traces.append(1)
         return explorer.improve(*args)
 
-    return explorer._replace(init=jax.jit(explorer.init), improve=jax.jit(improve)), traces
+    return jitted(explorer._replace(improve=improve)), explorer, traces
 
 
 def rounds(explorer, key, num=3):
     """Several rounds with 16 more transitions each; the last state and the metrics of each."""
     state, metrics = explorer.init(key), []
     for number in range(num):
-        state = explorer.observe(state, transitions(16, seed=number), jnp.ones(16, bool))
-        num_data = jnp.asarray(16 * (number + 1), jnp.int32)
-        state, new = explorer.improve(jax.random.fold_in(key, number), state, OBS, num_data)
+        state = explorer.observe(state, transitions(16, seed=number), np.ones(16, bool))
+        state, new = explorer.improve(jax.random.fold_in(key, number), state, OBS, np.int32(16 * (number + 1)))
         metrics.append(new)
     return state, metrics
 
@@ -420,7 +497,7 @@ def rounds(explorer, key, num=3):
 def test_improve_is_traced_once_and_repeats_to_the_bit(small):
     # three rounds, each with more data and so a longer fit, are one trace; a run again with the same key gives the
     # same numbers, with another key others
-    explorer, traces = small
+    explorer, _, traces = small
     first, again, other = (rounds(explorer, jax.random.key(seed)) for seed in (0, 0, 1))
     assert len(traces) == 1
     jax.tree.map(np.testing.assert_array_equal, first, again)
@@ -429,29 +506,52 @@ def test_improve_is_traced_once_and_repeats_to_the_bit(small):
 
 def test_seeds_side_by_side_are_seeds_one_by_one(small):
     # T16: vmap over two seeds gives the numbers of a loop over them, in float32 (reductions may differ in order)
-    explorer, _ = small
-    keys, num_data = [jax.random.key(1), jax.random.key(2)], jnp.asarray(16, jnp.int32)
-    states = [explorer.observe(explorer.init(key), transitions(16), jnp.ones(16, bool)) for key in keys]
-    batched = jax.jit(jax.vmap(explorer.improve, in_axes=(0, 0, None, None)))
-    together = batched(jnp.stack(keys), jax.tree.map(lambda *leaves: jnp.stack(leaves), *states), OBS, num_data)
+    explorer, plain, _ = small
+    keys = [jax.random.key(1), jax.random.key(2)]
+    states = [explorer.observe(explorer.init(key), transitions(16), np.ones(16, bool)) for key in keys]
+
+    @jax.jit
+    def batched(keys, states):
+        stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+        return jax.vmap(plain.improve, in_axes=(0, 0, None, None))(jnp.stack(keys), stacked, OBS, jnp.int32(16))
+
+    together = jax.device_get(batched(keys, states))
     for i, (key, state) in enumerate(zip(keys, states, strict=True)):
-        alone = explorer.improve(key, state, OBS, num_data)
+        alone = explorer.improve(key, state, OBS, np.int32(16))
         jax.tree.map(lambda a, b, i=i: np.testing.assert_allclose(a[i], b, rtol=1e-3, atol=1e-5), together, alone)
+
+
+def test_the_greedy_action_of_sac_is_its_squashed_mean(small):
+    # one leaky-ReLU layer and the first half of the last one, by hand on normalised observations; no key is looked at,
+    # and an action that is drawn is another
+    drawn = make_explorer(
+        METHODS["implicit"],
+        SIZES,
+        dataclasses.replace(SMALL, imagination=dataclasses.replace(SMALL.imagination, act_greedily=False)),
+    )
+    state, rows = begin(small[0]), transitions(6, seed=1)
+    actor = drawn.actor(state)
+    layers = jax.device_get(actor.behaviour)["mlp"]
+    hidden = normal(state, rows)[0] @ layers["hidden_0"]["kernel"] + layers["hidden_0"]["bias"]
+    last = np.where(hidden > 0, hidden, 0.01 * hidden) @ layers["output"]["kernel"] + layers["output"]["bias"]
+    want = np.tanh(last[:, : SIZES.action])
+    np.testing.assert_allclose(drawn.act_greedily(None, actor, rows.obs), want, rtol=1e-4, atol=1e-5)
+    assert np.max(np.abs(drawn.act(jax.random.key(0), actor, rows.obs) - want)) > 0.01
 
 
 def test_raw_rewards_are_in_the_observations_units(small):
     # reward_units="raw": entries times their std squared; stds of 1 give the normalised reward, of 3 nine times it
-    explorer, _ = small
-    raw = make_explorer(METHODS["implicit"], SIZES, dataclasses.replace(SMALL, reward_units="raw"))
+    explorer, _, _ = small
+    raw = jitted(make_explorer(METHODS["implicit"], SIZES, dataclasses.replace(SMALL, reward_units="raw")))
     state, rows = begin(explorer), transitions(8, seed=1)
     count = state.normalizers.delta.count
 
     def reward(explorer, std):
         delta = state.normalizers.delta.replace(sum_squares=count * std**2)
         new = state.replace(normalizers=state.normalizers.replace(delta=delta))
-        return float(explorer.assess(jax.random.key(3), new, rows, jnp.ones(8, bool))["intrinsic_reward"])
+        return float(explorer.assess(jax.random.key(3), new, rows, np.ones(8, bool))["intrinsic_reward"])
 
-    ones, threes = jnp.ones(3), 3.0 * jnp.ones(3)
+    ones, threes = np.ones(3, np.float32), np.full(3, 3, np.float32)
     normalized = reward(explorer, ones)
     assert reward(explorer, threes) == pytest.approx(normalized, rel=1e-5)
     assert [reward(raw, std) for std in (ones, threes)] == pytest.approx([normalized, 9 * normalized], rel=1e-5)
