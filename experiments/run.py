@@ -80,7 +80,7 @@ def parse(argv: Sequence[str]) -> tuple[CommandLine, RunSpec]:
     )
     description = (
         "Explore an environment by a belief's own uncertainty, and draw what was seen.\n\n"
-        "The defaults below are those of the preset; --preset=paper --help shows the paper's.\n"
+        "The defaults below are those of the preset; --preset=paper --help shows the paper's.\n\n"
         f"Settings that {start.config.method} reads come first; one that the chosen method does not read is refused."
     )
     command, changes = flags.parse(

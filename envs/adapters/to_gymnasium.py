@@ -92,7 +92,8 @@ class GymnasiumEnv(gymnasium.Env):
             if not self.action_space.contains(action):
                 raise ValueError(f"action is {action!r}. Allowed: {self.action_space}.")
             action = np.eye(self._env.spec.action_size, dtype=np.float32)[int(action)]
-        self._state, transition = self._env.step(self._state, np.asarray(action, np.float32))
+        entries: Any = np.asarray(action, np.float32)
+        self._state, transition = self._env.step(self._state, entries)
         obs, info = self._seen(transition.next_obs)
         reward, terminated, truncated = jax.device_get((transition.reward, transition.terminated, transition.truncated))
         return obs, float(reward), bool(terminated), bool(truncated), info

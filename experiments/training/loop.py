@@ -241,7 +241,5 @@ def last_state(
     if restored is None and checkpoints.steps():
         raise RunError(f"{directory} has no checkpoint up to step {until}, only of {checkpoints.steps()}.")
     if restored is None:
-        raise RunError(
-            f"{directory} has no checkpoint yet: let the run continue for {config.checkpoint_every:,} steps."
-        )
+        raise RunError(f"{directory} has no checkpoint yet: let it run for {config.checkpoint_every:,} steps.")
     return restored.state, restored.step

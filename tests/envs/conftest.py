@@ -29,7 +29,7 @@ def make_bead():
     """
 
     @functools.cache
-    def make(backend, obs_noise=0.0, episode_steps=7):
+    def make(backend, obs_noise, episode_steps):
         task = Task(
             spec=EnvSpec("bead", ("x [m]", "velocity [m/s]"), ("push [10 N]",), episode_steps, 0.02),
             model=mujoco.MjModel.from_xml_string(BEAD),
@@ -42,4 +42,4 @@ def make_bead():
         )
         return choose_engine(backend).make_environment(task, obs_noise)
 
-    return make
+    return lambda backend, obs_noise=0.0, episode_steps=7: make(backend, obs_noise, episode_steps)

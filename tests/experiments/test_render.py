@@ -89,7 +89,7 @@ def test_what_holds_no_run_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
 
 def test_a_run_without_a_checkpoint_is_said(finished, tmp_path: Path):
     (tmp_path / "config.json").write_bytes((finished.out / "config.json").read_bytes())
-    with pytest.raises(RunError, match="has no checkpoint yet: let the run go on for 20 steps"):
+    with pytest.raises(RunError, match="has no checkpoint yet: let it run for 20 steps"):
         render.load_actor(tmp_path)
 
 

@@ -1,6 +1,7 @@
 """The methods that the paper compares with: what each is put together from, and policies that imagine nothing."""
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +37,7 @@ SMALL = ExplorationConfig(
     ensemble=EnsembleConfig(num_members=M),
     imagination=TINY,
     reactive=ReactiveConfig(updates=5),
-    sac=SACConfig(hidden=(8, 8), batch_size=8),
+    sac=SACConfig(hidden=(8,), batch_size=8),
 )
 
 
@@ -45,8 +46,13 @@ def real_data(num, capacity=64):
     rng = np.random.default_rng(0)
     obs = rng.normal(size=(num, O)) + 1
     rows = (obs, rng.uniform(-1, 1, (num, A)), np.full(num, 7.0), obs + rng.normal(size=(num, O)))
-    flag = jnp.zeros(num, bool)
-    rows = Transition(*(jnp.asarray(x, jnp.float32) for x in rows), flag, flag)
+    flag = np.zeros(num, bool)
+    return experience_of(Transition(*(np.asarray(x, np.float32) for x in rows), flag, flag), capacity)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def experience_of(rows, capacity):
+    num = rows.obs.shape[0]
     data = replay.add(replay.init(jax.tree.map(lambda leaf: leaf[0], rows), capacity), rows)
     normalizers = dynamics.update_normalizers(dynamics.init_normalizers(O, A), rows, jnp.ones(num, bool))
     return Experience(jnp.arange(float(M)), data, jnp.int32(num), normalizers, rows.obs[0])
@@ -87,34 +93,40 @@ def test_a_reactive_policy_sees_real_transitions_alone(num_updates, restart_ever
     config = ReactiveConfig(updates=num_updates, restart_every=restart_every)
     behaviour = make_reactive(BELIEF, variance, recorder(16), O, A, config)
     experience = real_data(20)
-    state, improve = behaviour.init(jax.random.key(0)), jax.jit(behaviour.improve)
+    state, improve = jax.jit(behaviour.init)(jax.random.key(0)), jax.jit(behaviour.improve)
     for number, life in enumerate(lives):
         scale = 1.0 + number
         state, metrics = improve(
-            jax.random.key(number), state, experience._replace(models=scale * jnp.arange(float(M)))
+            jax.random.key(number), state, experience._replace(models=scale * np.arange(M, dtype=np.float32))
         )
         assert int(state.learner["updates"]) == life and set(metrics) == {"one"}
-        batch, stats = state.learner["batch"], experience.normalizers.obs
-        real = np.asarray((experience.data.rows.obs[:20] - stats.mean[None]) / stats.std[None])
-        gaps = np.max(np.abs(np.asarray(batch.obs)[:, None] - real[None]), axis=-1)
+        batch, rows, stats = jax.device_get((state.learner["batch"], experience.data.rows, experience.normalizers.obs))
+        real = (rows.obs[:20] - stats.mean) / np.asarray(stats.std)
+        gaps = np.max(np.abs(batch.obs[:, None] - real[None]), axis=-1)
         assert np.max(np.min(gaps, axis=1)) < 1e-5
         chosen = np.argmin(gaps, axis=1)
-        np.testing.assert_allclose(batch.action, experience.data.rows.action[chosen], rtol=1e-6)
+        np.testing.assert_allclose(batch.action, rows.action[chosen], rtol=1e-6)
         np.testing.assert_allclose(batch.reward, 1.25 * scale**2 * np.sum(real[chosen] ** 2, axis=1), rtol=1e-4)
         assert len(set(chosen)) > 8
     # and it carries no room for anything imagined
     assert all(leaf.shape[:1] in ((), (16,)) for leaf in jax.tree.leaves(state))
-    obs = experience.data.rows.obs[3]
-    action = behaviour.act(jax.random.key(0), behaviour.actor(state), experience.normalizers, obs)
+    act = jax.jit(behaviour.act)
+    action = act(jax.random.key(0), behaviour.actor(state), experience.normalizers, rows.obs[3])
     np.testing.assert_allclose(action, real[3, :A], rtol=1e-4)
+
+
+@jax.jit
+def labelled_by_spread(experience):
+    return label(
+        BELIEF, lambda prediction, delta, normalizers: rewards.trajectory_spread(delta), experience
+    ).rows.reward
 
 
 @pytest.mark.parametrize("num", [20, LABEL_CHUNK + 10])
 def test_rewards_that_compare_rows_see_held_rows_only(num):
     # room for 1,500 transitions, mostly empty: the spread is of chunks of real changes, about 1 an entry in normalised
     # units, where empty rows (a change of 0) would pull it down; rows that are not held have no reward
-    experience = real_data(num, capacity=1_500)
-    got = label(BELIEF, lambda prediction, delta, normalizers: rewards.trajectory_spread(delta), experience).rows.reward
+    got = np.asarray(labelled_by_spread(real_data(num, capacity=1_500)))
     np.testing.assert_allclose(got[:num], O, rtol=0.05)
     np.testing.assert_array_equal(got[num:], 0.0)
 
@@ -148,33 +160,42 @@ def test_settings_are_those_of_maxs_commands():
     assert METHODS["max"].settings(chain) == chain
 
 
-def prediction_of(means, var=None):
-    return Prediction(jnp.asarray(means, jnp.float32), var)
-
-
 def test_rewards_of_the_table():
     # each row's reward of the same prediction, against the function that it stands for, in the units of the settings
-    means = np.random.default_rng(0).normal(size=(M, 5, O))
-    delta = jnp.asarray(np.random.default_rng(1).normal(size=(5, O)), jnp.float32)
-    experience = real_data(20)
-    stats, prediction = experience.normalizers, prediction_of(means, 0.1 * jnp.ones((M, 5, O)))
+    means = np.random.default_rng(0).normal(size=(M, 5, O)).astype(np.float32)
+    delta = np.random.default_rng(1).normal(size=(5, O)).astype(np.float32)
 
-    def given(name, prediction=prediction, **settings):
-        return METHODS[name].reward(ExplorationConfig(**settings)).score(prediction, delta, stats)
+    def pairs(means, delta, stats):
+        prediction, chances = Prediction(means, jnp.full(means.shape, 0.1)), Prediction(jax.nn.softmax(means))
 
-    np.testing.assert_array_equal(given("disagreement"), rewards.variance(prediction))
-    for name in ("max", "max_reactive"):
-        np.testing.assert_array_equal(given(name), rewards.jensen_renyi(prediction, 0.1))
-        np.testing.assert_array_equal(given(name, renyi_decay=1.0), rewards.jensen_renyi(prediction, 1.0))
-    np.testing.assert_array_equal(given("max_trajectory"), rewards.trajectory_spread(delta))
-    for name in ("prediction_error", "icm", "icm_active"):
-        error = (means.mean(axis=0) - delta) * stats.delta.std[None] / stats.obs.std[None]
-        np.testing.assert_allclose(given(name), np.sum(error**2, axis=1), rtol=1e-4)
-        plain = rewards.prediction_error(prediction, delta)
-        np.testing.assert_array_equal(given(name, error_units="delta"), plain)
-    chances = prediction_of(jax.nn.softmax(means))
-    got = given("max", prediction=chances, dynamics=DynamicsConfig(target="one_hot"))
-    np.testing.assert_array_equal(got, rewards.jensen_shannon(chances))
+        def given(name, prediction=prediction, **settings):
+            return METHODS[name].reward(ExplorationConfig(**settings)).score(prediction, delta, stats)
+
+        one_hot = DynamicsConfig(target="one_hot")
+        exact = {
+            "disagreement": (given("disagreement"), rewards.variance(prediction)),
+            "max_trajectory": (given("max_trajectory"), rewards.trajectory_spread(delta)),
+            "max on the chain": (
+                given("max", prediction=chances, dynamics=one_hot),
+                rewards.jensen_shannon(chances),
+            ),
+        }
+        for name in ("max", "max_reactive"):
+            for decay in (0.1, 1.0):
+                settings = {} if decay == 0.1 else {"renyi_decay": decay}
+                exact[f"{name} {decay}"] = given(name, **settings), rewards.jensen_renyi(prediction, decay)
+        errors = ("prediction_error", "icm", "icm_active")
+        for name in errors:
+            exact[name] = given(name, error_units="delta"), rewards.prediction_error(prediction, delta)
+        return exact, [given(name) for name in errors]
+
+    stats = real_data(20).normalizers
+    exact, errors = jax.jit(pairs)(means, delta, stats)
+    for name, (got, want) in exact.items():
+        np.testing.assert_array_equal(got, want, err_msg=name)
+    error = (means.mean(axis=0) - delta) * np.asarray(stats.delta.std) / np.asarray(stats.obs.std)
+    for got in errors:
+        np.testing.assert_allclose(got, np.sum(error**2, axis=1), rtol=1e-4)
 
 
 @pytest.mark.parametrize("name", ["disagreement", "max", "max_reactive", "max_trajectory", "prediction_error"])
@@ -207,16 +228,14 @@ def test_a_round_of_a_baseline(name):
     config = dataclasses.replace(SMALL, imagination=dataclasses.replace(TINY, real_updates=0))
     explorer = make_explorer(method, SIZES, method.settings(config))
     experience, key = real_data(20), jax.random.key(0)
-    state = explorer.observe(
-        explorer.init(key), jax.tree.map(lambda x: x[:20], experience.data.rows), jnp.ones(20, bool)
-    )
-    after, metrics = jax.jit(explorer.improve)(key, state, experience.obs, jnp.int32(20))
+    rows = jax.tree.map(lambda leaf: np.asarray(leaf)[:20], experience.data.rows)
+    state = jax.jit(lambda key, rows: explorer.observe(explorer.init(key), rows, jnp.ones(20, bool)))(key, rows)
+    after, metrics = jax.jit(explorer.improve)(key, state, experience.obs, np.int32(20))
     assert ("policy/imagined_reward" in metrics) == (name == "max")
     for part in ("belief", "behaviour"):
         pairs = zip(jax.tree.leaves(getattr(state, part)), jax.tree.leaves(getattr(after, part)), strict=True)
         assert any(np.any(np.asarray(a) != np.asarray(b)) for a, b in pairs)
-    reported = jax.jit(explorer.assess)(
-        key, after, jax.tree.map(lambda x: x[:9], experience.data.rows), jnp.arange(9) != 2
-    )
+    new = jax.tree.map(lambda leaf: leaf[:9], rows)
+    reported = jax.jit(explorer.assess)(key, after, new, np.arange(9) != 2)
     assert {"variance", "divergence", "model_error", "intrinsic_reward_p95"} <= reported.keys()
     assert (float(reported["divergence"]) == pytest.approx(float(reported["intrinsic_reward"]))) == (name == "max")

@@ -63,36 +63,46 @@ def draw(key, shape):
 def test_the_gradient_is_that_of_the_printed_objective(x64, horizon):
     # against J written out, and its gradient against central differences in every direction
     policy, models = TanhGaussianPolicy((3,), ACTION, "tanh", "lecun", (-2.0, 0.0)), jnp.array([0.5, 1.0, 1.4])
-    params = policy.init(jax.random.key(0), jnp.zeros(OBS))["params"]
-    start = jax.random.normal(jax.random.key(1), (5, OBS))
+    shapes = jax.eval_shape(policy.init, jax.random.key(0), jnp.zeros(OBS))["params"]
+    rng = np.random.default_rng(0)
+    params = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape), shapes)
+    start = jnp.asarray(rng.normal(size=(5, OBS)))
     config = GradientPolicyConfig(horizon=horizon, discount=0.9)
-    flat, unravel = ravel_pytree(jax.tree.map(lambda x: jnp.asarray(x, float), params))
+    flat, unravel = ravel_pytree(params)
     normalizers = jax.tree.map(lambda x: x.astype(float), dynamics.init_normalizers(OBS, ACTION))
     world = World(make_belief(predict), models, normalizers, variance)
 
-    @jax.jit
     def expected(flat):
         key = jax.random.key(2)
         return imagined_return(key, policy, unravel(flat), world, start, config)[0]
 
-    want = written_out(jax.random.key(2), models, policy, unravel(flat), start, horizon)
-    assert float(expected(flat)) == pytest.approx(float(want), rel=1e-9)
-    gradient, step = jax.jit(jax.grad(expected))(flat), 1e-6
-    differences = [float(expected(flat + step * e) - expected(flat - step * e)) / (2 * step) for e in np.eye(len(flat))]
+    @jax.jit
+    def by_hand(flat):
+        return written_out(jax.random.key(2), models, policy, unravel(flat), start, horizon)
+
+    @jax.jit
+    def central(flat, step):
+        ends = jax.vmap(expected)(jnp.concatenate([flat[None] + step * jnp.eye(len(flat)) for step in (step, -step)]))
+        return (ends[: len(flat)] - ends[len(flat) :]) / (2 * step)
+
+    value, gradient = jax.jit(jax.value_and_grad(expected))(flat)
+    assert float(value) == pytest.approx(float(by_hand(flat)), rel=1e-9)
+    differences = central(flat, 1e-6)
     np.testing.assert_allclose(gradient, differences, rtol=1e-6, atol=1e-9)
     assert np.abs(differences).max() > 1e-2
 
 
-def experience(num=64):
-    obs = jax.random.normal(jax.random.key(5), (num, OBS))
+def make_belief(predict):
+    return beliefs.make_no_belief()._replace(predict=predict)
+
+
+@jax.jit
+def experience():
+    obs, num = jax.random.normal(jax.random.key(5), (64, OBS)), 64
     flags = jnp.zeros(num, bool)
     rows = Transition(obs, jnp.zeros((num, ACTION)), jnp.zeros(num), obs, flags, flags)
     data = replay.add(replay.init(jax.tree.map(lambda x: x[0], rows), num), rows)
     return Experience(jnp.array([0.5, 1.5]), data, jnp.int32(num), dynamics.init_normalizers(OBS, ACTION), obs[0])
-
-
-def make_belief(predict):
-    return beliefs.make_no_belief()._replace(predict=predict)
 
 
 def bent(models, inputs):
@@ -101,33 +111,44 @@ def bent(models, inputs):
     return Prediction(models[:, None, None] * jnp.repeat(height, OBS, axis=1)[None])
 
 
-def test_ascent_finds_the_best_action_and_the_penalty_pulls_it_back():
-    # the reward is 2 (gain spread 0.5)^2 (1 - (a - 0.6)^2 / 3)^2, largest at 0.6; a heavy penalty holds the mean at 0
-    for penalty, want in ((0.0, BEST), (100.0, 0.0)):
+@pytest.fixture(scope="module")
+def climbers():
+    """By whether a round starts from a new policy: without a penalty it does, with a heavy one it continues.
+
+    Each as `round(init_key, improve_key) -> (policy, what it does, metrics)`, compiled.
+    """
+    seen = experience()
+
+    def make(restart):
+        settings = {} if restart else {"policy_penalty": 100.0, "normalize_reward": True}
         config = GradientPolicyConfig(
-            updates=300, batch_size=32, lr=1e-2, hidden=(8,), policy_penalty=penalty, normalize_reward=penalty > 0
+            updates=300, batch_size=32, lr=1e-2, hidden=(8,), restart=restart, **{"policy_penalty": 0.0, **settings}
         )
         behaviour = make_gradient_policy(make_belief(bent), variance, OBS, ACTION, config)
-        seen = experience()
-        improve = jax.jit(behaviour.improve)
-        state, metrics = improve(jax.random.key(1), behaviour.init(jax.random.key(0)), seen)
-        action = behaviour.act(jax.random.key(2), behaviour.actor(state), seen.normalizers, seen.data.rows.obs)
+
+        @jax.jit
+        def one_round(init_key, improve_key):
+            state, metrics = behaviour.improve(improve_key, behaviour.init(init_key), seen)
+            actor = behaviour.actor(state)
+            return state.params, behaviour.act(improve_key, actor, seen.normalizers, seen.data.rows.obs), metrics
+
+        return one_round
+
+    return {restart: make(restart) for restart in (True, False)}
+
+
+def test_ascent_finds_the_best_action_and_the_penalty_pulls_it_back(climbers):
+    # the reward is 2 (gain spread 0.5)^2 (1 - (a - 0.6)^2 / 3)^2, largest at 0.6; a heavy penalty holds the mean at 0
+    for restart, want in ((True, BEST), (False, 0.0)):
+        _, action, metrics = climbers[restart](jax.random.key(0), jax.random.key(1))
         np.testing.assert_allclose(action, want, atol=0.1)
     assert float(metrics["saturation"]) < 0.1
 
 
-def test_a_policy_starts_anew_each_round_or_goes_on():
-    behaviours = {
-        restart: make_gradient_policy(
-            make_belief(bent), variance, OBS, ACTION, GradientPolicyConfig(updates=1, hidden=(4,), restart=restart)
-        )
-        for restart in (True, False)
-    }
-    seen = experience()
-    for restart, behaviour in behaviours.items():
-        starts = [behaviour.init(jax.random.key(i)) for i in (0, 1)]
-        improve = jax.jit(behaviour.improve)
-        ends = [ravel_pytree(improve(jax.random.key(2), start, seen)[0].params)[0] for start in starts]
+def test_a_round_starts_from_a_new_policy_or_continues(climbers):
+    # from two policies, with the same draws: the same end, or not
+    for restart, one_round in climbers.items():
+        ends = [ravel_pytree(one_round(jax.random.key(i), jax.random.key(2))[0])[0] for i in (0, 1)]
         assert np.array_equal(*ends) == restart
 
 

@@ -1,5 +1,7 @@
 """Imagined rollouts against dynamics iterated by hand in NumPy: three linear models, a linear policy."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -40,17 +42,20 @@ def reward(prediction, delta, normalizers):
     return jnp.sum(prediction.mean[:, :, 0], axis=0) + 10 * delta[:, 0]
 
 
-def world_of(predict=predict, score=reward, models=MODELS):
+def world_of(models, predict=predict, score=reward):
     """Models, the belief that runs them, and what their predictions are worth."""
     belief: Belief = make_no_belief()._replace(predict=predict)
-    return World(belief, jnp.asarray(models), NORMALIZERS, score)
+    return World(belief, models, NORMALIZERS, score)
+
+
+@functools.partial(jax.jit, static_argnums=(3, 4, 5, 6))
+def run(key, models, start, horizon, mover, bound, act):
+    return rollout(key, act, world_of(models), start, horizon, mover, bound)
 
 
 def imagine(mover="per_step", bound=0.0, horizon=H, start=START, seed=0, act=act, models=MODELS):
     """As NumPy arrays."""
-    world = world_of(models=models)
-    rows = rollout(jax.random.key(seed), act, world, jnp.asarray(start), horizon, mover, bound)
-    return jax.tree.map(np.asarray, rows)
+    return jax.device_get(run(jax.random.key(seed), models, start, horizon, mover, bound, act))
 
 
 def by_hand(obs, action):
@@ -116,11 +121,16 @@ def test_models_that_state_a_variance_are_drawn_from():
         mean = predict(models, inputs).mean
         return Prediction(mean, jnp.broadcast_to(jnp.asarray(var), mean.shape))
 
+    start = np.tile(START[:1], (4_000, 1))
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def moved(mover):
+        world = world_of(jnp.asarray(MODELS[:1]), stating, lambda prediction, delta, _: delta[:, 1])
+        return rollout(jax.random.key(0), act, world, jnp.asarray(start), 1, mover)
+
     def changes(mover):
-        start = jnp.tile(jnp.asarray(START[:1]), (4_000, 1))
-        world = world_of(stating, lambda prediction, delta, _: delta[:, 1], MODELS[:1])
-        rows = rollout(jax.random.key(0), act, world, start, 1, mover)
-        return (rows.next_obs[0] - start - MEANS["delta"][None]) / STDS["delta"][None], rows.reward[0]
+        rows = jax.device_get(moved(mover))
+        return (rows.next_obs[0] - start - MEANS["delta"]) / STDS["delta"], rows.reward[0]
 
     want = by_hand(START[0], np.tanh(START[0] @ GAIN))[0][0]
     for mover in ("per_step", "per_rollout"):
@@ -181,8 +191,8 @@ def test_policy_draws_anew_at_each_step():
 @pytest.mark.parametrize("mover", ["per_step", "per_rollout", "mean"])
 def test_jit_changes_nothing(mover):
     # the same rollout, step by step in Python and compiled
-    compiled = imagine(mover)
+    compiled = imagine(mover, horizon=2)
     with jax.disable_jit():
-        stepped = imagine(mover)
+        stepped = imagine(mover, horizon=2)
     for a, b in zip(compiled, stepped, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)

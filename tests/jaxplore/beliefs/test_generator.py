@@ -17,7 +17,7 @@ TARGET = MLP(hidden=(48,), output_size=3)
 def draws(config, tree=None, num_inits=128, num_networks=32):
     """Networks of many generators, fresh from `init`: every leaf `[inits, networks, ...]`."""
     if tree is None:
-        tree = TARGET.init(jax.random.key(0), jnp.zeros(6))["params"]
+        tree = jax.jit(TARGET.init)(jax.random.key(0), np.zeros(6, np.float32))["params"]
     generator = make_generator(tree, config)
 
     def one(key):
@@ -43,7 +43,10 @@ def relu_correlation(rho: float) -> float:
 def test_sampled_networks_start_with_the_spread_that_the_rule_gives(rule, constant_fraction, want):
     # over inits and networks. Kernels: mean 0, and the std of He, LeCun or the example's root mean square; a leaf with
     # one axis: around the example's value (a LayerNorm's scale is 1) with std bias_std
-    tree = {"dense": jnp.full((20, 30), 0.01), "conv": jnp.full((3, 20, 10), -4.0), "scale": jnp.ones(50)}
+    tree = {
+        name: np.full(shape, value, np.float32)
+        for name, shape, value in (("dense", (20, 30), 0.01), ("conv", (3, 20, 10), -4.0), ("scale", (50,), 1.0))
+    }
     config = GeneratorConfig(init_std=rule, constant_fraction=constant_fraction, bias_std=0.2)
     networks = draws(config, tree)
     for name, std in zip(("dense", "conv"), want, strict=True):
