@@ -96,7 +96,7 @@ FIELDS: dict[str, Field] = {
             ("policy/distance", "", "that it makes in actions"),
             ("policy/extrinsic_value", "scaled reward", "PPO's value of the task's reward"),
             ("policy/intrinsic_value", "scaled reward", "PPO's value of the bonus"),
-            ("policy/rnd_error", "mean squared error of the distilled features", "of the last distillation step"),
+            ("policy/rnd_error", "squared distillation error", "of the last distillation step"),
             ("policy/updated", "0 or 1", "whether PPO learned in this round"),
             ("policy/intrinsic_reward", "scaled reward", "bonus of the round's transitions as the policy gets it"),
             ("policy/intrinsic_reward_p95", "scaled reward", "95th percentile of the same"),

@@ -20,8 +20,8 @@ from jaxplore.normalizer import Normalizer
 from jaxplore.types import Array, Key, Params
 from jaxplore.validate import Checks
 
-UNIT = "mean squared error of the distilled features"
-"""Of the bonus, before it is divided by a standard deviation."""
+UNIT = "squared distillation error"
+"""Of the bonus, a mean over features, before it is divided by a standard deviation."""
 
 
 @dataclass(frozen=True)
