@@ -3,7 +3,8 @@
 Each gives batches of transitions, as a replay that has seen uniform actions would.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -57,3 +58,24 @@ def target_action(key: Key, num: int) -> Transition:
 PROBES: dict[str, Callable[[Key, int], Transition]] = {
     probe.__name__: probe for probe in (constant, predictable, two_steps, endless, target_action)
 }
+
+BATCH_SIZE = 64
+
+
+def train_on_each(
+    makers: Sequence[Callable[[Key, int], Transition]],
+    learn: Callable[[Transition], Any],
+    steps: int,
+) -> list[Any]:
+    """What `learn(batches [steps, BATCH_SIZE, ...])` gives for each probe, as NumPy arrays; one program for all."""
+
+    @jax.jit
+    def run(key: Key) -> Any:
+        rows = [maker(key, steps * BATCH_SIZE) for maker in makers]
+        batches = jax.tree.map(
+            lambda *leaves: jnp.stack([leaf.reshape(steps, BATCH_SIZE, *leaf.shape[1:]) for leaf in leaves]), *rows
+        )
+        return jax.vmap(learn)(batches)
+
+    learned = jax.device_get(run(jax.random.key(2)))
+    return [jax.tree.map(lambda leaf, i=i: leaf[i], learned) for i in range(len(makers))]

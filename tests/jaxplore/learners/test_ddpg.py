@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxplore.learners.ddpg import DDPGConfig, make_ddpg, perturb
+from jaxplore.learners.ddpg import DDPGConfig, adapt_noise, make_ddpg, make_networks, perturb
 from jaxplore.types import Transition
 from tests.jaxplore import classic, probes
 
@@ -61,45 +61,84 @@ def test_only_hidden_kernels_of_the_value_are_penalised():
 
 
 def still(**settings):
-    """DDPG whose policy hardly changes, so that only the noise does."""
-    shared = {"hidden": (16,), "actor_lr": 1e-9, "critic_lr": 1e-9, "batch_size": 64}
-    return make_ddpg(3, 2, DDPGConfig(**{**shared, **settings}))
+    """DDPG whose policy hardly changes, so that only the noise does: its settings."""
+    shared = {"hidden": (16,), "actor_lr": 1e-9, "critic_lr": 1e-9, "batch_size": 64, "layer_norm": False}
+    return DDPGConfig(**{**shared, **settings})
 
 
-def run(ddpg, steps):
-    """States and metrics of `steps` updates on random observations; with the first state."""
-    obs = jax.random.normal(jax.random.key(3), (64, 3))
-    batch = batch_of(obs)._replace(action=jnp.zeros((64, 2)))
+@pytest.fixture(scope="module")
+def updated():
+    """By the noise that it starts with: `(first state, metrics, perturbed policies)` of nine updates.
 
-    def step(state, key):
-        after, metrics = ddpg.update(key, state, batch)
-        return after, (metrics, after.perturbed)
+    Every third one adapts the noise, which is far too small, and every fourth redraws the policy that acts.
+    """
+    ddpg = make_ddpg(3, 2, still(target_distance=10.0, adapt_every=3, redraw_every=4))
 
-    scan = jax.jit(lambda first: jax.lax.scan(step, first, jax.random.split(jax.random.key(4), steps))[1])
-    first = ddpg.init(jax.random.key(5))
-    return first, *scan(first)
+    @jax.jit
+    @jax.vmap
+    def run(noise_std):
+        obs = jax.random.normal(jax.random.key(3), (64, 3))
+        batch = batch_of(obs)._replace(action=jnp.zeros((64, 2)))
+        first = ddpg.init(jax.random.key(5))
+        noisy = perturb(jax.random.key(6), first.params["actor"], noise_std)
+        first = first.replace(noise_std=noise_std, perturbed=noisy)
+
+        def step(state, key):
+            after, metrics = ddpg.update(key, state, batch)
+            return after, (metrics, after.perturbed)
+
+        return first, *jax.lax.scan(step, first, jax.random.split(jax.random.key(4), 9))[1]
+
+    both = jax.device_get(run(jnp.array([0.3, 0.0])))
+    return ddpg, {noise: jax.tree.map(lambda leaf, i=i: leaf[i], both) for i, noise in enumerate((0.3, 0.0))}
+
+
+def adapted(config, starts, steps):
+    """`(noise, distance)`, each `[starts, steps]`, where the policy stands still."""
+    networks = make_networks(3, 2, config)
+
+    @jax.jit
+    def run(starts):
+        obs = jax.random.normal(jax.random.key(3), (64, 3))
+        policy = make_ddpg(3, 2, config).init(jax.random.key(5)).params["actor"]
+
+        def one(start):
+            def step(noise, t):
+                key = jax.random.fold_in(jax.random.key(4), t)
+                noise, distance = adapt_noise(networks, key, policy, noise, obs, t + 1)
+                return noise, (noise, distance)
+
+            return jax.lax.scan(step, start, jnp.arange(steps))[1]
+
+        return jax.vmap(one)(starts)
+
+    return jax.device_get(run(jnp.array(starts)))
+
+
+def test_noise_grows_by_the_factor_at_each_adaptation(updated):
+    # every third update of 9: after 3, 6 and 9
+    want = 0.3 * 1.01 ** np.array([0, 0, 1, 1, 1, 2, 2, 2, 3])
+    np.testing.assert_allclose(updated[1][0.3][1]["noise_std"], want, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("target", "change"), [(1e-6, 1 / 1.01), (10.0, 1.01)])
-def test_noise_grows_or_shrinks_by_the_factor_at_each_adaptation(target, change):
-    # every third update of 7: after 3 and 6
-    _, metrics, _ = run(still(target_distance=target, adapt_every=3, noise_std=0.3), 7)
-    want = 0.3 * change ** np.array([0, 0, 1, 1, 1, 2, 2])
-    np.testing.assert_allclose(metrics["noise_std"], want, rtol=1e-5)
+def test_noise_grows_or_shrinks_by_the_factor(target, change):
+    # the same of the adaptation alone, whichever way it goes: after 3 and 6 of 7
+    noise, _ = adapted(still(target_distance=target, adapt_every=3), [0.3], 7)
+    np.testing.assert_allclose(noise[0], 0.3 * change ** np.array([0, 0, 1, 1, 1, 2, 2]), rtol=1e-5)
 
 
 @pytest.mark.parametrize("layer_norm", [True, False])
 def test_noise_adapts_until_actions_are_the_target_distance_apart(layer_norm):
     # from far below and far above; what is measured is one draw, so on average
-    for start in (0.002, 5.0):
-        ddpg = still(adapt_every=1, adapt_factor=1.05, noise_std=start, target_distance=0.2, layer_norm=layer_norm)
-        distance = np.asarray(run(ddpg, 400)[1]["distance"])
+    config = still(adapt_every=1, adapt_factor=1.05, target_distance=0.2, layer_norm=layer_norm)
+    for distance in adapted(config, [0.002, 5.0], 400)[1]:
         assert abs(np.log(np.mean(distance[:5]) / 0.2)) > 1.0
         assert np.mean(distance[-200:]) == pytest.approx(0.2, abs=0.04)
 
 
-def test_no_noise_stays_none():
-    first, metrics, perturbed = run(still(noise_std=0.0, redraw_every=1, adapt_every=1), 3)
+def test_no_noise_stays_none(updated):
+    first, metrics, perturbed = updated[1][0.0]
     np.testing.assert_array_equal(metrics["noise_std"], 0.0)
     for got, plain in zip(jax.tree.leaves(perturbed), jax.tree.leaves(first.params["actor"]), strict=True):
         np.testing.assert_allclose(got, np.broadcast_to(plain, got.shape), atol=1e-6)
@@ -107,11 +146,16 @@ def test_no_noise_stays_none():
 
 def test_noise_is_on_everything_but_layer_normalisation():
     # 4,000 numbers with noise of 0.5 each: their standard deviation is within 5 of its standard errors
-    params = still(hidden=(64, 64)).init(jax.random.key(0)).params["actor"]
-    noisy = perturb(jax.random.key(1), params, jnp.float32(0.5))
+    @jax.jit
+    def draw(key):
+        params = make_ddpg(3, 2, still(hidden=(64, 64), layer_norm=True)).init(key).params["actor"]
+        return params, perturb(jax.random.key(1), params, 0.5)
+
+    params, noisy = jax.device_get(draw(jax.random.key(0)))
+    assert "norm_1" in params
     for name, layer in params.items():
         for leaf in layer:
-            difference = np.asarray(noisy[name][leaf] - layer[leaf])
+            difference = noisy[name][leaf] - layer[leaf]
             if name.startswith("norm_"):
                 assert not difference.any()
             else:
@@ -121,20 +165,19 @@ def test_noise_is_on_everything_but_layer_normalisation():
     assert abs(np.corrcoef(*kernels)[0, 1]) < 0.5
 
 
-def test_the_policy_that_acts_is_redrawn_and_the_one_that_measures_is_another():
+def test_the_policy_that_acts_is_redrawn_and_the_one_that_measures_is_another(updated):
     # redrawn after updates 4 and 8, the same in between; every measurement has a draw of its own
-    ddpg = still(redraw_every=4, adapt_every=100)
-    first, metrics, perturbed = run(ddpg, 9)
-    kernels = np.asarray(perturbed["hidden_0"]["kernel"])
+    ddpg, (first, metrics, perturbed) = updated[0], updated[1][0.3]
+    kernels = perturbed["hidden_0"]["kernel"]
     changed = [
         not np.array_equal(a, b) for a, b in itertools.pairwise([first.perturbed["hidden_0"]["kernel"], *kernels])
     ]
     assert changed == [False, False, False, True, False, False, False, True, False]
-    assert len(set(np.asarray(metrics["distance"]).tolist())) == 9
-    actor, obs = ddpg.actor(first), jnp.ones((5, 3))
-    greedy, drawn = ddpg.act_greedily(actor, obs), ddpg.act(jax.random.key(0), actor, obs)
+    assert len(set(metrics["distance"].tolist())) == 9
+    act, actor, obs = jax.jit(ddpg.act), ddpg.actor(first), np.ones((5, 3), np.float32)
+    greedy, drawn = ddpg.act_greedily(actor, obs), act(jax.random.key(0), actor, obs)
     assert np.sqrt(np.mean((np.asarray(greedy) - np.asarray(drawn)) ** 2)) > 0.01
-    np.testing.assert_array_equal(drawn, ddpg.act(jax.random.key(1), actor, obs))
+    np.testing.assert_array_equal(drawn, act(jax.random.key(1), actor, obs))
 
 
 @pytest.fixture(scope="module")
@@ -142,24 +185,21 @@ def trained():
     """On every probe, side by side in one program, 2,000 updates of batch 64 with a discount of 0.5."""
     shared = {"hidden": (32, 32), "layer_norm": False, "activation": "tanh", "init": "lecun", "critic_l2": 0.0}
     ddpg = make_ddpg(1, 1, DDPGConfig(**shared, actor_lr=1e-3, critic_lr=3e-3, discount=0.5, tau=0.05))
-    names, steps = list(probes.PROBES), 2000
-    batches = [probes.PROBES[name](jax.random.key(2), steps * 64) for name in names]
-    batches = jax.tree.map(lambda *rows: jnp.stack(rows).reshape(len(names), steps, 64, *rows[0].shape[1:]), *batches)
 
     def learn(rows):
         step = lambda state, batch: (ddpg.update(jax.random.key(1), state, batch)[0], None)  # noqa: E731
         return jax.lax.scan(step, ddpg.init(jax.random.key(0)), rows)[0]
 
-    states = jax.jit(jax.vmap(learn))(batches)
-    return ddpg, {name: jax.tree.map(lambda x, i=i: x[i], states) for i, name in enumerate(names)}
+    states = probes.train_on_each(list(probes.PROBES.values()), learn, 2000)
+    return ddpg, dict(zip(probes.PROBES, states, strict=True))
 
 
 def value(state, obs, action):
     """The action value at one observation: a tanh network written out."""
-    x = jnp.array([obs, action])
+    x = np.array([obs, action])
     for name in ("hidden_0", "hidden_1"):
         layer = state.params["critic"][name]
-        x = jnp.tanh(x @ layer["kernel"] + layer["bias"])
+        x = np.tanh(x @ layer["kernel"] + layer["bias"])
     return float((x @ state.params["critic"]["output"]["kernel"])[0] + state.params["critic"]["output"]["bias"][0])
 
 

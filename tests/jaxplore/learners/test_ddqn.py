@@ -110,26 +110,24 @@ NAMES = ("constant", "predictable", "two_steps", "endless")
 def trained():
     """Double DQN on batches of 64 from each probe with a discount of 0.5, side by side in one program."""
     config = DDQNConfig(hidden=(32, 32), lr=3e-3, discount=0.5, target_every=20)
-    ddqn, steps = make_ddqn(1, 2, config), 1500
-    makers = [*(probes.PROBES[name] for name in NAMES), choice]
-    batches = [probe(jax.random.key(2), steps * 64) for probe in makers]
-    batches = jax.tree.map(lambda *rows: jnp.stack(rows).reshape(len(rows), steps, 64, *rows[0].shape[1:]), *batches)
-    # The probes push; here a push to the left is the first choice, one to the right the second.
-    batches = batches._replace(action=jax.nn.one_hot((batches.action[..., 0] > 0).astype(int), 2))
+    ddqn = make_ddqn(1, 2, config)
 
-    def run(rows):
+    def learn(rows):
+        # The probes push; here a push to the left is the first choice, one to the right the second.
+        rows = rows._replace(action=jax.nn.one_hot((rows.action[..., 0] > 0).astype(int), 2))
         step = lambda state, batch: ddqn.update(jax.random.key(0), state, batch)  # noqa: E731
         return jax.lax.scan(step, ddqn.init(jax.random.key(0)), rows)[0]
 
-    states = jax.jit(jax.vmap(run))(batches)
-    return ddqn, {name: jax.tree.map(lambda x, i=i: x[i], states) for i, name in enumerate((*NAMES, "choice"))}
+    makers = {**{name: probes.PROBES[name] for name in NAMES}, "choice": choice}
+    states = probes.train_on_each(list(makers.values()), learn, 1500)
+    return ddqn, dict(zip(makers, states, strict=True))
 
 
 def values(state, obs):
     """Both action values at one observation: a tanh network written out."""
-    x = jnp.array([obs])
+    x = np.array([obs])
     for name in ("hidden_0", "hidden_1"):
-        x = jnp.tanh(x @ state.params[name]["kernel"] + state.params[name]["bias"])
+        x = np.tanh(x @ state.params[name]["kernel"] + state.params[name]["bias"])
     return x @ state.params["output"]["kernel"] + state.params["output"]["bias"]
 
 

@@ -177,16 +177,14 @@ def train(names, steps, **settings):
     """SAC on batches of 64 from each probe, side by side in one program; `(sac, states, metrics)` by probe."""
     shared = {"hidden": (32, 32), "lr": 3e-3, "tau": 0.05, "policy_penalty": 0.0, "log_std_min": -5.0, "init": "lecun"}
     sac = make_sac(1, 1, SACConfig(**shared, **settings))
-    batches = [probes.PROBES[name](jax.random.key(2), steps * 64) for name in names]
-    batches = jax.tree.map(lambda *rows: jnp.stack(rows).reshape(len(names), steps, 64, *rows[0].shape[1:]), *batches)
 
-    def run(rows):
+    def learn(rows):
         step = lambda state, scanned: sac.update(scanned[0], state, scanned[1])  # noqa: E731
         return jax.lax.scan(step, sac.init(jax.random.key(0)), (jax.random.split(jax.random.key(1), steps), rows))
 
-    states, metrics = jax.jit(jax.vmap(run))(batches)
-    pick = lambda tree, i: jax.tree.map(lambda leaf: leaf[i], tree)  # noqa: E731
-    return sac, {n: pick(states, i) for i, n in enumerate(names)}, {n: pick(metrics, i) for i, n in enumerate(names)}
+    learned = probes.train_on_each([probes.PROBES[name] for name in names], learn, steps)
+    states, metrics = zip(*learned, strict=True)
+    return sac, dict(zip(names, states, strict=True)), dict(zip(names, metrics, strict=True))
 
 
 @pytest.fixture(scope="module")
@@ -197,7 +195,7 @@ def trained():
 
 def values(state, obs, action=0.0):
     """`(Q of each member, V)` at one observation."""
-    obs, action = jnp.array([[obs]]), jnp.array([[action]])
+    obs, action = np.array([[obs]]), np.array([[action]])
     both = [float(q_value(state.params, obs, action, k)[0]) for k in (0, 1)]
     return [*both, float(mlp(state.params["v"], obs)[0, 0])]
 
