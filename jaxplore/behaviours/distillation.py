@@ -124,6 +124,16 @@ def make_rnd_ppo(
 
     Raises:
         ValueError: a round brings more transitions than an update takes.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jaxplore import dynamics
+        >>> behaviour = make_rnd_ppo(
+        ...     2, 1, steps_per_round=25, warm_up_steps=256, ppo_config=PPOConfig(hidden=(8,)),
+        ...     rnd_config=RNDConfig(hidden=(8,), features=8))
+        >>> actor = behaviour.actor(jax.jit(behaviour.init)(jax.random.key(0)))
+        >>> behaviour.act_greedily(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
+        (5, 1)
     """
     ppo_config, rnd_config = ppo_config or PPOConfig(), rnd_config or RNDConfig()
     if ppo_config.rollout_steps < steps_per_round:
@@ -289,6 +299,16 @@ def make_rnd_learner(
     Returns:
         A `Behaviour`. The metrics are the learner's, from the last update, `rnd_error`, `intrinsic_reward` and
         `intrinsic_reward_p95` (of the round's transitions, scaled; 0 where there are none).
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jaxplore import dynamics, learners
+        >>> sac = learners.make_sac(2, 1, learners.SACConfig(hidden=(8,)))
+        >>> behaviour = make_rnd_learner(
+        ...     sac, 2, steps_per_round=25, rnd_config=RNDConfig(hidden=(8,), features=8))
+        >>> actor = behaviour.actor(jax.jit(behaviour.init)(jax.random.key(0)))
+        >>> behaviour.act(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
+        (5, 1)
     """
     config, rnd_config = config or ReactiveConfig(), rnd_config or RNDConfig()
     parts = RNDLearner(learner, make_rnd(obs_size, rnd_config), steps_per_round, config, rnd_config)

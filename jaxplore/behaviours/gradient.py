@@ -136,9 +136,9 @@ def imagined_return(
         ...     belief, models, dynamics.init_normalizers(2, 1),
         ...     lambda prediction, delta, normalizers: rewards.variance(prediction))
         >>> config = GradientPolicyConfig(horizon=3)
-        >>> gradient = jax.grad(lambda params: imagined_return(
-        ...     jax.random.key(3), policy, params, world, jnp.zeros((16, 2)), config)[0])(params)
-        >>> gradient["mlp"]["output"]["kernel"].shape
+        >>> gradient = jax.jit(jax.grad(lambda params: imagined_return(
+        ...     jax.random.key(3), policy, params, world, jnp.zeros((16, 2)), config)[0]))
+        >>> gradient(params)["mlp"]["output"]["kernel"].shape
         (8, 2)
     """
 

@@ -119,6 +119,18 @@ def make_imagination(
 
     Raises:
         ValueError: the belief does not predict.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jaxplore import beliefs, dynamics, learners, rewards
+        >>> belief = beliefs.make_generator_belief(2, 1, dynamics.DynamicsConfig(hidden=(8,)))
+        >>> sac = learners.make_sac(2, 1, learners.SACConfig(hidden=(8,)))
+        >>> behaviour = make_imagination(
+        ...     belief, lambda prediction, delta, normalizers: rewards.variance(prediction), sac, 2, 1,
+        ...     ImaginationConfig(num_actors=16, horizon=5, replay_capacity=4000))
+        >>> actor = behaviour.actor(jax.jit(behaviour.init)(jax.random.key(0)))
+        >>> behaviour.act(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
+        (5, 1)
     """
     if belief.predict is None:
         raise ValueError("belief predicts nothing, so nothing can be imagined. Allowed: a belief with `predict`.")

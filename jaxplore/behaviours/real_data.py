@@ -94,6 +94,17 @@ def make_reactive(
 
     Raises:
         ValueError: the belief does not predict.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jaxplore import beliefs, dynamics, learners, rewards
+        >>> belief = beliefs.make_ensemble_belief(2, 1, 5, dynamics_config=dynamics.DynamicsConfig(hidden=(8,)))
+        >>> sac = learners.make_sac(2, 1, learners.SACConfig(hidden=(8,)))
+        >>> behaviour = make_reactive(
+        ...     belief, lambda prediction, delta, normalizers: rewards.prediction_error(prediction, delta), sac, 2, 1)
+        >>> actor = behaviour.actor(jax.jit(behaviour.init)(jax.random.key(0)))
+        >>> behaviour.act(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
+        (5, 1)
     """
     if belief.predict is None:
         raise ValueError("belief predicts nothing, so nothing can be labelled. Allowed: a belief with `predict`.")
@@ -163,6 +174,15 @@ def make_model_free(
 
     Returns:
         A `Behaviour`. The metrics are the learner's, from the last update.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jaxplore import dynamics, learners
+        >>> ddqn = learners.make_ddqn(4, 2, learners.DDQNConfig(hidden=(8,)))
+        >>> behaviour = make_model_free(ddqn, 4, 2, ModelFreeConfig(normalize_obs=False))
+        >>> actor = behaviour.actor(jax.jit(behaviour.init)(jax.random.key(0)))
+        >>> behaviour.act_greedily(jax.random.key(1), actor, dynamics.init_normalizers(4, 2), jnp.eye(4)).shape
+        (4, 2)
     """
     config = config or ModelFreeConfig()
 

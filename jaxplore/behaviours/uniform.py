@@ -18,7 +18,15 @@ def uniform_actions(key: Key, obs: Array, action_size: int, discrete: bool = Fal
 
 
 def make_uniform(action_size: int, discrete: bool = False) -> Behaviour:
-    """Uniform actions, always: in [-1, 1], or one of `action_size` choices."""
+    """Uniform actions, always: in [-1, 1], or one of `action_size` choices.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jaxplore import dynamics
+        >>> behaviour = make_uniform(2)
+        >>> behaviour.act(jax.random.key(0), (), dynamics.init_normalizers(3, 2), jnp.zeros((5, 3))).shape
+        (5, 2)
+    """
 
     def act(key: Key, actor: Any, normalizers: Normalizers, obs: Array) -> Array:
         return uniform_actions(key, obs, action_size, discrete)

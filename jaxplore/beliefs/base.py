@@ -140,7 +140,12 @@ def fit(
 
 
 def make_no_belief() -> Belief:
-    """The belief of a method that models nothing: an empty state that no data changes."""
+    """The belief of a method that models nothing: an empty state that no data changes.
+
+    Example:
+        >>> make_no_belief().predict is None
+        True
+    """
     return Belief(
         init=lambda key: (),
         update=lambda key, state, data, normalizers: (state, {}),

@@ -50,6 +50,12 @@ def device_step(device):
     assert len(traces) == 1
 
 
+@pytest.fixture(scope="module")
+def device_start(device):
+    """`BATCH` ants on the device, at their starts."""
+    return jax.jit(jax.vmap(device.reset))(jax.random.split(jax.random.key(0), BATCH))
+
+
 def host_states(host, qpos, qvel=None):
     """One host state for each row of `qpos` `[B, 15]` and `qvel` `[B, 14]`."""
     blank, states = host.reset(jax.random.key(0)), []
@@ -61,11 +67,10 @@ def host_states(host, qpos, qvel=None):
     return states
 
 
-def device_states(device, states):
+def device_states(device_start, states):
     """The same states on the device, stacked."""
-    blank = jax.vmap(device.reset)(jax.random.split(jax.random.key(0), len(states)))
     physics = jnp.asarray(np.stack([state.physics for state in states]), jnp.float32)
-    return blank.replace(physics=blank.physics.replace(qpos=physics[:, 1:16], qvel=physics[:, 16:30]))
+    return device_start.replace(physics=device_start.physics.replace(qpos=physics[:, 1:16], qvel=physics[:, 16:30]))
 
 
 def contacts(model, state):
@@ -76,9 +81,9 @@ def contacts(model, state):
     return data
 
 
-def compare(host, device, device_step, states, actions):
+def compare(host, device_start, device_step, states, actions):
     """Steps both engines through `actions` `[T, B, 8]`. Largest differences in qpos and in the velocities, `[T]`."""
-    on_device, qpos, velocities = device_states(device, states), [], []
+    on_device, qpos, velocities = device_states(device_start, states), [], []
     for action in actions:
         on_device, got = device_step(on_device, np.float32(action))
         pairs = [host.step(state, a) for state, a in zip(states, action, strict=True)]
@@ -255,8 +260,9 @@ class TestReset:
         assert not np.array_equal(first.obs, other.obs)
 
     def test_engines_start_alike(self, host, device):
+        reset = jax.jit(device.reset)
         for seed in range(3):
-            on_host, on_device = host.reset(jax.random.key(seed)), jax.jit(device.reset)(jax.random.key(seed))
+            on_host, on_device = host.reset(jax.random.key(seed)), reset(jax.random.key(seed))
             np.testing.assert_allclose(on_device.obs, on_host.obs, rtol=0, atol=1e-7)
             np.testing.assert_allclose(on_device.physics.qpos, on_host.physics[1:16], rtol=0, atol=1e-7)
             np.testing.assert_allclose(on_device.physics.qvel, on_host.physics[16:30], rtol=0, atol=1e-7)
@@ -289,9 +295,8 @@ class TestEpisode:
         assert flags[:299] == [(False, False)] * 299
         assert flags[299:] == [(False, True)] * 2
 
-    def test_device_counts_alike(self, device, device_step):
-        states = jax.jit(jax.vmap(device.reset))(jax.random.split(jax.random.key(0), BATCH))
-        states = states.replace(num_steps=jnp.arange(295, 303, dtype=jnp.int32))
+    def test_device_counts_alike(self, device_start, device_step):
+        states = device_start.replace(num_steps=jnp.arange(295, 303, dtype=jnp.int32))
         states, transitions = device_step(states, jnp.zeros((BATCH, 8)))
         np.testing.assert_array_equal(transitions.truncated, np.arange(296, 304) >= 300)
         assert not transitions.terminated.any()
@@ -319,8 +324,8 @@ class TestEpisode:
                 np.testing.assert_array_equal(a, b)
         np.testing.assert_array_equal(saved.physics, frozen)
 
-    def test_a_saved_device_state_continues_to_the_bit(self, device, device_step):
-        states = jax.vmap(device.reset)(jax.random.split(jax.random.key(0), BATCH))
+    def test_a_saved_device_state_continues_to_the_bit(self, device_start, device_step):
+        states = device_start
         actions = np.random.default_rng(0).uniform(-1, 1, (12, BATCH, 8)).astype(np.float32)
         for action in actions[:6]:
             states, _ = device_step(states, action)
@@ -337,25 +342,25 @@ class TestEpisode:
 class TestParity:
     """MJX in float32 against C MuJoCo in float64, from the same numbers. Bounds are a few times what was measured."""
 
-    def test_in_the_air(self, host, device, device_step):
+    def test_in_the_air(self, host, device_start, device_step):
         rng = np.random.default_rng(0)
         qpos = np.tile(STANDING, (BATCH, 1))
         qpos[:, :3] = 2, 2, 40  # Above the inner wall and far from the others; 2.5 s are 30 m down.
         qpos[:, 7:] += rng.uniform(-0.2, 0.2, (BATCH, 8))
         states = host_states(host, qpos, rng.normal(0, 0.1, (BATCH, 14)))
         actions = 0.02 * rng.uniform(-1, 1, (50, BATCH, 8))  # Gentle: joint limits are met at a moment, and amplify.
-        differences = compare(host, device, device_step, states, actions)
+        differences = compare(host, device_start, device_step, states, actions)
         assert_close(differences, first=(2e-5, 5e-5), last=(2e-4, 5e-4))
 
-    def test_standing_on_the_floor(self, host, device, device_step, model):
+    def test_standing_on_the_floor(self, host, device_start, device_step, model):
         qpos = np.tile(STANDING, (BATCH, 1))
         qpos[:7, :2] = CENTRES
         states = host_states(host, qpos)
-        *differences, states = compare(host, device, device_step, states, np.zeros((50, BATCH, 8)))
+        *differences, states = compare(host, device_start, device_step, states, np.zeros((50, BATCH, 8)))
         assert all(contacts(model, state).ncon >= 4 for state in states)
         assert_close(differences, first=(1e-6, 1e-5), last=(5e-6, 5e-5))
 
-    def test_against_the_walls(self, host, device, device_step, model):
+    def test_against_the_walls(self, host, device_start, device_step, model):
         # Into each outer wall, and into the inner one from the south, the north, its end and at a slant.
         places = [(-0.3, 0), (4.3, 0), (0, -0.3), (0, 4.3), (0, 0.3), (2, 3.7), (3.7, 2), (0, -0.3)]
         towards = [(-1, 0), (1, 0), (0, -1), (0, 1), (0, 1), (0, -1), (-1, 0), (0.3, -1)]
@@ -366,7 +371,7 @@ class TestParity:
         touched = [host.step(state, np.zeros(8))[0] for state in states]
         for state, name in zip(touched, names, strict=True):
             assert model.geom(name).id in contacts(model, state).contact.geom
-        differences = compare(host, device, device_step, states, np.zeros((50, BATCH, 8)))
+        differences = compare(host, device_start, device_step, states, np.zeros((50, BATCH, 8)))
         assert_close(differences, first=(5e-6, 5e-5), last=(5e-4, 5e-4))
 
 

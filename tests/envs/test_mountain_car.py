@@ -76,10 +76,21 @@ def test_a_whole_drive_is_gymnasiums(env, step, peer):
     assert 60 < state.num_steps < 200
 
 
-def test_the_flag_ends_an_episode_and_pays_100(env):
-    collect = make_collect(env, 400)
-    run = jax.jit(lambda key, state: collect(key, state, with_velocity, 400))
-    _, rows, _ = run(jax.random.key(1), env.reset(jax.random.key(0)))
+@pytest.fixture(scope="module")
+def drive(env):
+    """`drive(full_throttle, num_steps) -> transitions`: the way it rolls, or always forward."""
+    collect = make_collect(env, 501)
+
+    @jax.jit
+    def run(full_throttle, num_steps):
+        act = lambda key, obs: jnp.where(full_throttle, 1.0, with_velocity(key, obs))  # noqa: E731
+        return collect(jax.random.key(1), env.reset(jax.random.key(0)), act, num_steps)[1]
+
+    return lambda full_throttle, num_steps: jax.tree.map(lambda leaf: leaf[:num_steps], run(full_throttle, num_steps))
+
+
+def test_the_flag_ends_an_episode_and_pays_100(drive):
+    rows = drive(False, 400)
     ends = np.asarray(rows.terminated)
     assert 2 <= ends.sum() <= 6
     assert not np.any(rows.truncated)
@@ -89,10 +100,8 @@ def test_the_flag_ends_an_episode_and_pays_100(env):
     assert np.all((starts[:, 0] >= -0.6) & (starts[:, 0] <= -0.4) & (starts[:, 1] == 0))
 
 
-def test_full_throttle_alone_does_not_reach_the_flag_and_is_cut_at_500(env):
-    collect = make_collect(env, 501)
-    run = jax.jit(lambda key, state: collect(key, state, lambda key, obs: jnp.ones(1), 501))
-    _, rows, _ = run(jax.random.key(1), env.reset(jax.random.key(0)))
+def test_full_throttle_alone_does_not_reach_the_flag_and_is_cut_at_500(drive):
+    rows = drive(True, 501)
     assert not np.any(rows.terminated)
     np.testing.assert_array_equal(np.flatnonzero(rows.truncated), [499])
     assert np.all(rows.reward == 0)

@@ -1,7 +1,10 @@
-"""Every row of the methods table fits the loop, as far as shapes tell."""
+"""Every row of the methods table fits the loop, as far as shapes tell, and reads the settings that it says."""
+
+import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from jaxplore import behaviours, beliefs, dynamics
@@ -11,8 +14,8 @@ from jaxplore.exploration import make_explorer
 from jaxplore.learners import sac
 from jaxplore.learners.ddpg import DDPGConfig
 from jaxplore.learners.ppo import PPOConfig
-from jaxplore.methods import METHODS
-from jaxplore.signals.distillation import RNDConfig
+from jaxplore.methods import METHODS, SHARED
+from jaxplore.signals.distillation import UNIT, RNDConfig
 from jaxplore.types import Transition
 
 NUM_SEEDS, ROWS = 2, 5
@@ -56,3 +59,87 @@ def test_a_round_keeps_the_shapes_of_the_state(name):
     assert action.shape == (NUM_SEEDS, ROWS, 2)
     for metric, value in metrics.items():
         assert value.shape == (NUM_SEEDS,) and jnp.issubdtype(value.dtype, jnp.floating), metric
+
+
+class Recorder:
+    """A configuration that notes which of its fields are read."""
+
+    def __init__(self, config):
+        self._config, self.seen = config, set()
+
+    def __getattr__(self, name):
+        self.seen.add(name)
+        return getattr(self._config, name)
+
+
+CHAIN = dataclasses.replace(CONFIG, planner="mcts", dynamics=dynamics.DynamicsConfig(hidden=(4,), target="one_hot"))
+PLANNED = ("implicit", "disagreement", "max")
+
+
+@pytest.mark.parametrize(
+    ("name", "config"),
+    [*((name, CONFIG) for name in sorted(METHODS)), *((name, CHAIN) for name in PLANNED)],
+    ids=[*sorted(METHODS), *(f"{name} by tree search" for name in PLANNED)],
+)
+def test_a_method_reads_the_settings_that_it_declares(name, config):
+    # no more, so that what a user sets is refused where it does nothing; and no fewer, so that it is not refused where
+    # it does something. Read while belief, reward and behaviour are made; what all methods share counts for none
+    method = METHODS[name]
+    sizes = Sizes(3, 2, discrete=config is CHAIN or method.actions == "discrete", one_hot_obs=config is CHAIN)
+    config = method.settings(config)
+    recorder = Recorder(config)
+    belief, reward = method.belief(sizes, recorder), method.reward(recorder)
+    method.behaviour(sizes, recorder, belief, reward.score)
+    declared = method.reads(config) - set(SHARED)
+    assert declared == method.reads(recorder) - set(SHARED)
+    if belief.predict is None:
+        assert recorder.seen - set(SHARED) == declared
+    else:
+        # Of every belief the divergence is reported, too.
+        assert recorder.seen - set(SHARED) | {"renyi_decay"} == declared
+    assert set(SHARED) <= method.reads(config)
+    assert declared <= {field.name for field in dataclasses.fields(ExplorationConfig)}
+
+
+def test_planners_read_their_own_settings():
+    # and not the other's
+    assert {"sac", "imagination"} <= METHODS["implicit"].reads(CONFIG) and "mcts" not in METHODS["implicit"].reads(
+        CONFIG
+    )
+    assert "mcts" in METHODS["implicit"].reads(CHAIN) and not {"sac", "imagination"} & METHODS["implicit"].reads(CHAIN)
+
+
+DELTA, RAW, OF_OBS = "normalised delta, squared", "raw units, squared", "std of the observation, squared"
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "unit"),
+    [
+        ("implicit", {}, DELTA),
+        ("implicit", {"reward_units": "raw"}, RAW),
+        ("implicit", {"planner": "mcts", "dynamics": CHAIN.dynamics}, "probability, squared"),
+        ("max", {}, "nats"),
+        ("max_trajectory", {}, "normalised delta"),
+        ("icm", {}, OF_OBS),
+        ("icm", {"error_units": "delta"}, DELTA),
+        ("rnd", {}, UNIT),
+        ("rnd_sac", {}, UNIT),
+    ],
+)
+def test_the_intrinsic_reward_has_a_unit(name, settings, unit):
+    # by the settings; labels of plots have it
+    chain = "planner" in settings
+    explorer = make_explorer(METHODS[name], Sizes(3, 2, chain, chain), dataclasses.replace(CONFIG, **settings))
+    assert explorer.reward_unit == unit
+
+
+@pytest.mark.parametrize("name", ["ddqn", "psne", "psne_no_norm", "sac", "sac_v2", "random"])
+def test_methods_without_an_intrinsic_reward_report_none(name):
+    # whatever the transitions are
+    sizes = Sizes(3, 2, discrete=name == "ddqn", has_reward=True)
+    explorer = make_explorer(METHODS[name], sizes, CONFIG)
+    obs, flags = np.ones((ROWS, 3), np.float32), np.ones(ROWS, bool)
+    rows = Transition(obs, obs[:, :2], obs[:, 0], obs, ~flags, ~flags)
+    assert explorer.reward_unit is None
+    state = jax.eval_shape(explorer.init, jax.random.key(0))
+    assert jax.eval_shape(explorer.assess, jax.random.key(1), state, rows, flags) == {}
