@@ -99,7 +99,7 @@ class Checks:
         >>> import types
         >>> Checks(types.SimpleNamespace(lr=-1.0)).in_range("lr", 0.0)
         Traceback (most recent call last):
-        ValueError: SimpleNamespace.lr=-1.0 is out of range. Allowed: a finite number in [0, inf).
+        jaxplore.validate.FieldError: SimpleNamespace.lr=-1.0 is out of range. Allowed: a finite number in [0, inf).
     """
 
     def __init__(self, config: Any) -> None:

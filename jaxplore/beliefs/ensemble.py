@@ -37,12 +37,12 @@ _POISSON_CDF = tuple(itertools.accumulate(math.exp(-1.0) / math.factorial(count)
 class EnsembleConfig:
     """How many members a static ensemble has, and what they differ by apart from initialisation and batches."""
 
-    num_members: int = 32
-    """M, static networks; all of them are drawn for a round. Paper: 32."""
     bootstrap: Bootstrap = "none"
     """Weights of transitions, fixed for each member and transition from the transition's arrival on. `none`: 1
     (nnaisense/max). `poisson`: independent Poisson counts of mean 1. `multinomial`: as many copies as there are
     members, each copy given to a random member."""
+    num_members: int = 32
+    """M, static networks; all of them are drawn for a round. Paper: 32."""
 
     def __post_init__(self) -> None:
         checks = Checks(self)

@@ -93,7 +93,9 @@ def test_a_belief_judges_as_its_encoding_does_by_hand(target: str):
 
 
 def test_m_is_the_ensembles_own():
-    belief = make_ensemble_belief(3, 1, dynamics_config=DynamicsConfig(hidden=(4,)), ensemble_config=EnsembleConfig(6))
+    belief = make_ensemble_belief(
+        3, 1, dynamics_config=DynamicsConfig(hidden=(4,)), ensemble_config=EnsembleConfig(num_members=6)
+    )
     assert belief.num_models == 6
     state = belief.init(jax.random.key(0))
     assert jax.tree.leaves(belief.sample(jax.random.key(1), state, belief.num_models))[0].shape[0] == 6
