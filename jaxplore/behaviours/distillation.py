@@ -134,14 +134,6 @@ def make_rnd_ppo(
         >>> actor = behaviour.actor(jax.jit(behaviour.init)(jax.random.key(0)))
         >>> behaviour.act_greedily(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
         (5, 1)
-
-    Example:
-        >>> import jax, jax.numpy as jnp
-        >>> from jaxplore import PPOConfig, RNDConfig, dynamics
-        >>> behaviour = make_rnd_ppo(2, 1, 25, 256, PPOConfig(hidden=(8,)), RNDConfig(hidden=(8,), features=4))
-        >>> actor = behaviour.actor(behaviour.init(jax.random.key(0)))
-        >>> behaviour.act(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
-        (5, 1)
     """
     ppo_config, rnd_config = ppo_config or PPOConfig(), rnd_config or RNDConfig()
     if ppo_config.rollout_steps < steps_per_round:
@@ -315,15 +307,6 @@ def make_rnd_learner(
         >>> behaviour = make_rnd_learner(
         ...     sac, 2, steps_per_round=25, rnd_config=RNDConfig(hidden=(8,), features=8))
         >>> actor = behaviour.actor(jax.jit(behaviour.init)(jax.random.key(0)))
-        >>> behaviour.act(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
-        (5, 1)
-
-    Example:
-        >>> import jax, jax.numpy as jnp
-        >>> from jaxplore import RNDConfig, SACConfig, dynamics, make_sac
-        >>> sac = make_sac(2, 1, SACConfig(hidden=(8,)))
-        >>> behaviour = make_rnd_learner(sac, 2, 25, rnd_config=RNDConfig(hidden=(8,), features=4))
-        >>> actor = behaviour.actor(behaviour.init(jax.random.key(0)))
         >>> behaviour.act(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
         (5, 1)
     """

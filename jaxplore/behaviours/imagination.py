@@ -131,17 +131,6 @@ def make_imagination(
         >>> actor = behaviour.actor(jax.jit(behaviour.init)(jax.random.key(0)))
         >>> behaviour.act(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
         (5, 1)
-
-    Example:
-        >>> import jax, jax.numpy as jnp
-        >>> from jaxplore import SACConfig, dynamics, make_generator_belief, make_sac, rewards
-        >>> belief = make_generator_belief(2, 1, dynamics.DynamicsConfig(hidden=(8,)))
-        >>> score = lambda prediction, delta, normalizers: rewards.variance(prediction)
-        >>> sac = make_sac(2, 1, SACConfig(hidden=(8,)))
-        >>> behaviour = make_imagination(belief, score, sac, 2, 1, ImaginationConfig())
-        >>> actor = behaviour.actor(behaviour.init(jax.random.key(0)))
-        >>> behaviour.act(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
-        (5, 1)
     """
     if belief.predict is None:
         raise ValueError("belief predicts nothing, so nothing can be imagined. Allowed: a belief with `predict`.")

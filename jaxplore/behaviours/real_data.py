@@ -105,16 +105,6 @@ def make_reactive(
         >>> actor = behaviour.actor(jax.jit(behaviour.init)(jax.random.key(0)))
         >>> behaviour.act(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
         (5, 1)
-
-    Example:
-        >>> import jax, jax.numpy as jnp
-        >>> from jaxplore import SACConfig, dynamics, make_generator_belief, make_sac, rewards
-        >>> belief = make_generator_belief(2, 1, dynamics.DynamicsConfig(hidden=(8,)))
-        >>> score = lambda prediction, delta, normalizers: rewards.variance(prediction)
-        >>> behaviour = make_reactive(belief, score, make_sac(2, 1, SACConfig(hidden=(8,))), 2, 1)
-        >>> actor = behaviour.actor(behaviour.init(jax.random.key(0)))
-        >>> behaviour.act(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
-        (5, 1)
     """
     if belief.predict is None:
         raise ValueError("belief predicts nothing, so nothing can be labelled. Allowed: a belief with `predict`.")
@@ -193,14 +183,6 @@ def make_model_free(
         >>> actor = behaviour.actor(jax.jit(behaviour.init)(jax.random.key(0)))
         >>> behaviour.act_greedily(jax.random.key(1), actor, dynamics.init_normalizers(4, 2), jnp.eye(4)).shape
         (4, 2)
-
-    Example:
-        >>> import jax, jax.numpy as jnp
-        >>> from jaxplore import SACConfig, dynamics, make_sac
-        >>> behaviour = make_model_free(make_sac(2, 1, SACConfig(hidden=(8,))), 2, 1)
-        >>> actor = behaviour.actor(behaviour.init(jax.random.key(0)))
-        >>> behaviour.act(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
-        (5, 1)
     """
     config = config or ModelFreeConfig()
 

@@ -26,14 +26,6 @@ def make_uniform(action_size: int, discrete: bool = False) -> Behaviour:
         >>> behaviour = make_uniform(2)
         >>> behaviour.act(jax.random.key(0), (), dynamics.init_normalizers(3, 2), jnp.zeros((5, 3))).shape
         (5, 2)
-
-    Example:
-        >>> import jax, jax.numpy as jnp
-        >>> from jaxplore import dynamics
-        >>> behaviour = make_uniform(1)
-        >>> actor = behaviour.actor(behaviour.init(jax.random.key(0)))
-        >>> behaviour.act(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
-        (5, 1)
     """
 
     def act(key: Key, actor: Any, normalizers: Normalizers, obs: Array) -> Array:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxplore.types import Array, Key, Transition
+from tests.jaxplore import programs
 
 
 def _batch(obs: Array, action: Array, reward: Array, next_obs: Array, terminated: Array) -> Transition:
@@ -63,19 +64,24 @@ BATCH_SIZE = 64
 
 
 def train_on_each(
-    makers: Sequence[Callable[[Key, int], Transition]],
-    learn: Callable[[Transition], Any],
-    steps: int,
+    makers: Sequence[Callable[[Key, int], Transition]], learn: Callable[..., Any], steps: int, *more: Array
 ) -> list[Any]:
-    """What `learn(batches [steps, BATCH_SIZE, ...])` gives for each probe, as NumPy arrays; one program for all."""
+    """What `learn(batches [steps, BATCH_SIZE, ...], *more)` gives for each probe, as NumPy arrays; one program for all.
 
-    @jax.jit
+    Args:
+        makers: the probes.
+        learn: what is done with each.
+        steps: batches.
+        *more: one row for each probe.
+    """
+
+    @programs.compiled
     def run(key: Key) -> Any:
         rows = [maker(key, steps * BATCH_SIZE) for maker in makers]
         batches = jax.tree.map(
             lambda *leaves: jnp.stack([leaf.reshape(steps, BATCH_SIZE, *leaf.shape[1:]) for leaf in leaves]), *rows
         )
-        return jax.vmap(learn)(batches)
+        return jax.vmap(learn)(batches, *more)
 
     learned = jax.device_get(run(jax.random.key(2)))
     return [jax.tree.map(lambda leaf, i=i: leaf[i], learned) for i in range(len(makers))]

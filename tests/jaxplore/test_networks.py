@@ -23,8 +23,9 @@ def density(action, mean, std):
 
 
 def draw(mean, log_std, num, seed=0):
-    params = GaussianParams(jnp.full((num, np.size(mean)), mean), jnp.full((num, np.size(mean)), log_std))
-    return jax.tree.map(np.asarray, jax.jit(sample_tanh_gaussian)(jax.random.key(seed), params))
+    number = jnp.result_type(float)
+    params = GaussianParams(*(np.full((num, np.size(mean)), value, number) for value in (mean, log_std)))
+    return jax.device_get(jax.jit(sample_tanh_gaussian)(jax.random.key(seed), params))
 
 
 @pytest.mark.parametrize(("mean", "log_std"), [(0.0, 0.0), (0.7, -1.0), (-1.5, -0.3)])
@@ -69,28 +70,34 @@ def test_saturated_actions_have_a_true_log_prob(mean, log_std):
     actions, log_probs = draw(mean, log_std, 50)
     np.testing.assert_allclose(log_probs[keep], want[keep, 0], rtol=2e-3, atol=1e-2)
     assert np.all(np.isfinite(log_probs)) and np.all(np.abs(actions) <= 1)
-    gradient = jax.grad(lambda m: jnp.sum(sample_tanh_gaussian(jax.random.key(0), GaussianParams(m, 0 * m))[1]))
     # d log p / d mean through the sample is 2 tanh(u): the Gaussian's part cancels
-    np.testing.assert_allclose(gradient(jnp.full((4, 1), 30.0)), 2.0, rtol=1e-5)
+    np.testing.assert_allclose(slope_of_the_mean(np.full((4, 1), 30, np.float32)), 2.0, rtol=1e-5)
+
+
+@jax.jit
+@jax.grad
+def slope_of_the_mean(mean):
+    return jnp.sum(sample_tanh_gaussian(jax.random.key(0), GaussianParams(mean, 0 * mean))[1])
 
 
 def test_sample_follows_the_gradient_of_its_parameters(x64):
     # reparametrised: da/dmean = 1 - a^2, da/dlog_std = (1 - a^2) (arctanh(a) - mean)
-    params = GaussianParams(jnp.array([0.4]), jnp.array([-0.7]))
-    action = sample_tanh_gaussian(jax.random.key(3), params)[0][0]
-    gradient = jax.grad(lambda p: sample_tanh_gaussian(jax.random.key(3), p)[0][0])(params)
-    assert float(gradient.mean[0]) == pytest.approx(float(1 - action**2), rel=1e-9)
-    assert float(gradient.log_std[0]) == pytest.approx(float((1 - action**2) * (jnp.arctanh(action) - 0.4)), rel=1e-9)
+    params = GaussianParams(np.array([0.4]), np.array([-0.7]))
+    sample = jax.jit(jax.value_and_grad(lambda params: sample_tanh_gaussian(jax.random.key(3), params)[0][0]))
+    action, gradient = jax.device_get(sample(params))
+    assert gradient.mean[0] == pytest.approx(1 - action**2, rel=1e-9)
+    assert gradient.log_std[0] == pytest.approx((1 - action**2) * (np.arctanh(action) - 0.4), rel=1e-9)
 
 
 def test_log_std_stays_in_its_bounds():
     # low + (high - low) / 2 (tanh(head) + 1): the middle (-9 for [-20, 2]) at head 0, the ends at +-large
     policy = TanhGaussianPolicy((4,), 1)
-    params = jax.tree.map(jnp.zeros_like, policy.init(jax.random.key(0), jnp.zeros(2))["params"])
+    shapes = jax.eval_shape(policy.init, jax.random.key(0), jnp.zeros(2))["params"]
+    params, ones = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes), np.ones(2, np.float32)
 
     def log_std(head):
-        params["mlp"]["output"]["bias"] = jnp.array([0.3, head])
-        out = policy.apply({"params": params}, jnp.ones(2))
+        params["mlp"]["output"]["bias"][:] = 0.3, head
+        out = jax.jit(policy.apply)({"params": params}, ones)
         assert float(tanh_mean(out)[0]) == pytest.approx(math.tanh(0.3), rel=1e-6)
         return float(out.log_std[0])
 
@@ -103,7 +110,7 @@ def test_log_std_stays_in_its_bounds():
 def test_mlp_is_its_formula():
     # two matrices and a ReLU (leaky: slope 0.01; swish: x sigmoid(x)) in NumPy, for any leading axes
     net = MLP((5,), 2)
-    params = net.init(jax.random.key(0), jnp.zeros(3))["params"]
+    params = jax.device_get(jax.jit(net.init)(jax.random.key(0), np.zeros(3, np.float32)))["params"]
     x = np.random.default_rng(0).normal(size=(4, 6, 3)).astype(np.float32)
     hidden = x @ np.asarray(params["hidden_0"]["kernel"])
     formulas = {
@@ -113,7 +120,7 @@ def test_mlp_is_its_formula():
         "tanh": np.tanh(hidden),
     }
     for name, value in formulas.items():
-        got = MLP((5,), 2, activation=name).apply({"params": params}, jnp.asarray(x))
+        got = jax.jit(MLP((5,), 2, activation=name).apply)({"params": params}, x)
         np.testing.assert_allclose(got, value @ np.asarray(params["output"]["kernel"]), rtol=1e-4, atol=1e-5)
     assert count_params(params) == 3 * 5 + 5 + 5 * 2 + 2
 
@@ -123,7 +130,7 @@ def test_mlp_is_its_formula():
 )
 def test_initialisers_have_the_variance_of_their_name(init, want):
     # He 2 / in, LeCun 1 / in, Xavier 2 / (in + out); orthogonal: columns of length 1 at right angles
-    params = MLP((100,), 1, init_name=init).init(jax.random.key(0), jnp.zeros(200))["params"]
+    params = jax.jit(MLP((100,), 1, init_name=init).init)(jax.random.key(0), np.zeros(200, np.float32))["params"]
     kernel = np.asarray(params["hidden_0"]["kernel"])
     if want is None:
         np.testing.assert_allclose(kernel.T @ kernel, np.eye(100), atol=1e-5)

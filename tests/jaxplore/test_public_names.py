@@ -1,62 +1,96 @@
 """What `jaxplore` exports suffices: a belief is trained, sampled, imagined in and turned into behaviour by it alone."""
 
+import ast
+import pathlib
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import jaxplore as jx
+
+NUM, NUM_MODELS, NUM_ACTORS, HORIZON = 256, 8, 4, 5
 
 
 def test_a_belief_is_trained_sampled_and_imagined_in_by_exported_names():
     # a point whose place moves by a tenth of the push: the models learn that, and the policy is trained in them
-    key = jax.random.key(0)
-    obs = jax.random.normal(key, (512, 2))
-    action = jax.random.uniform(jax.random.key(1), (512, 2), minval=-1.0, maxval=1.0)
-    zero, flag = jnp.zeros(512), jnp.zeros(512, bool)
-    transitions = jx.Transition(obs, action, zero, obs + 0.1 * action, flag, flag)
-    data = jx.replay.add(jx.replay.init(jax.tree.map(lambda leaf: leaf[0], transitions), 512), transitions)
-    normalizers = jx.dynamics.update_normalizers(jx.dynamics.init_normalizers(2, 2), transitions, ~flag)
-
-    belief = jx.make_generator_belief(
+    belief: jx.Belief = jx.make_generator_belief(
         *(2, 2),
         jx.DynamicsConfig(hidden=(16,)),
         jx.GeneratorConfig(hidden=(16,), noise_size=4),
-        jx.SVGDConfig(num_particles=8, temperature=0.02, tempering="per_datum"),
+        jx.SVGDConfig(num_particles=NUM_MODELS, temperature=0.02, tempering="per_datum"),
         jx.FitConfig(lr=3e-3, batch_size=64),
     )
-    state = belief.init(jax.random.key(2))
-
-    def error(state) -> float:
-        models = belief.sample(jax.random.key(3), state, belief.num_models)
-        prediction, target = belief.judge(models, normalizers, transitions)
-        return float(jnp.mean((prediction.mean.mean(axis=0) - target) ** 2))
-
-    start = error(state)
-    update = jax.jit(lambda key, state: belief.update(key, state, data, normalizers)[0])
-    for i in range(300):
-        state = update(jax.random.fold_in(key, i), state)
-    assert error(state) < 0.2 * start
-
-    models = belief.sample(jax.random.key(4), state, belief.num_models)
-
-    def score(prediction: jx.Prediction, delta: jax.Array, normalizers: jx.Normalizers) -> jax.Array:
-        return jx.rewards.variance(prediction)
-
-    world = jx.World(belief, models, normalizers, score)
-    imagined = jx.rollout(
-        jax.random.key(5), lambda key, obs: jnp.ones((obs.shape[0], 2)), world, jnp.zeros((4, 2)), horizon=5
+    disagreement = jx.Reward(
+        lambda prediction, delta, normalizers: jx.rewards.variance(prediction), "normalised delta, squared"
     )
-    assert imagined.next_obs.shape == (5, 4, 2) and bool((imagined.reward >= 0).all())
-    # five pushes of a tenth lead half a metre away
-    assert jnp.allclose(imagined.next_obs[-1], 0.5, atol=0.15)
-
-    sac = jx.make_sac(2, 2, jx.SACConfig(hidden=(8,), batch_size=16))
+    sac: jx.Learner = jx.make_sac(2, 2, jx.SACConfig(hidden=(8,), batch_size=16))
     config = jx.ImaginationConfig(
-        num_actors=8, horizon=3, num_rollouts=2, num_random_rollouts=1, updates_per_rollout=2, real_updates=0
+        num_actors=8,
+        horizon=3,
+        num_rollouts=2,
+        num_random_rollouts=1,
+        updates_per_rollout=2,
+        real_updates=0,
+        replay_capacity=64,
     )
-    behaviour: jx.Behaviour = jx.make_imagination(belief, score, sac, 2, 2, config)
-    experience = jx.Experience(models, data, jnp.int32(512), normalizers, obs[0])
-    before = behaviour.init(jax.random.key(6))
-    after, metrics = jax.jit(behaviour.improve)(jax.random.key(7), before, experience)
-    assert int(after.age) == 1 and int(after.imagined.size) == 2 * 8 * 3
-    assert float(metrics["imagined_reward"]) > 0
-    assert behaviour.act(jax.random.key(8), behaviour.actor(after), normalizers, obs).shape == (512, 2)
+    behaviour: jx.Behaviour = jx.make_imagination(belief, disagreement.score, sac, 2, 2, config)
+
+    @jax.jit
+    def fit(key):
+        """The belief's state, the data, their statistics, and the models' error on them before and after the fit."""
+        obs_key, action_key, init_key, steps_key, models_key = jax.random.split(key, 5)
+        obs = jax.random.normal(obs_key, (NUM, 2))
+        action = jax.random.uniform(action_key, (NUM, 2), minval=-1.0, maxval=1.0)
+        zero, flag = jnp.zeros(NUM), jnp.zeros(NUM, bool)
+        transitions = jx.Transition(obs, action, zero, obs + 0.1 * action, flag, flag)
+        data = jx.replay.add(jx.replay.init(jax.tree.map(lambda leaf: leaf[0], transitions), NUM), transitions)
+        normalizers = jx.dynamics.update_normalizers(jx.dynamics.init_normalizers(2, 2), transitions, ~flag)
+
+        def error(state):
+            models = belief.sample(models_key, state, belief.num_models)
+            prediction, target = belief.judge(models, normalizers, transitions)
+            return jnp.mean((jnp.mean(prediction.mean, axis=0) - target) ** 2)
+
+        def update(i, state):
+            return belief.update(jax.random.fold_in(steps_key, i), state, data, normalizers)[0]
+
+        start = belief.init(init_key)
+        state = jax.lax.fori_loop(0, 300, update, start)
+        return state, data, normalizers, error(start), error(state)
+
+    state, data, normalizers, before, after = fit(jax.random.key(0))
+    assert after < 0.2 * before
+
+    @jax.jit
+    def explore(key):
+        """What a rollout of a fixed push meets; and the policy before and after a round, its state and its actions."""
+        models_key, rollout_key, init_key, improve_key, act_key = jax.random.split(key, 5)
+        models = belief.sample(models_key, state, belief.num_models)
+        world = jx.World(belief, models, normalizers, disagreement.score)
+        push = lambda key, obs: jnp.ones((obs.shape[0], 2))  # noqa: E731
+        imagined = jx.rollout(rollout_key, push, world, jnp.zeros((NUM_ACTORS, 2)), HORIZON)
+        experience = jx.Experience(models, data, jnp.int32(NUM), normalizers, data.rows.obs[0])
+        first = behaviour.init(init_key)
+        last, metrics = behaviour.improve(improve_key, first, experience)
+        actors = behaviour.actor(first), behaviour.actor(last)
+        return imagined, actors, last, metrics, behaviour.act(act_key, actors[1], normalizers, data.rows.obs)
+
+    imagined, (untrained, trained), last, metrics, action = jax.device_get(explore(jax.random.key(1)))
+    assert imagined.next_obs.shape == (HORIZON, NUM_ACTORS, 2) and np.all(imagined.reward >= 0)
+    assert np.any(imagined.reward > 0)
+    # five pushes of a tenth lead half a metre away
+    np.testing.assert_allclose(imagined.next_obs[-1], 0.5, atol=0.15)
+    assert last.age == 1 and last.imagined.size == 2 * 8 * 3
+    assert metrics["imagined_reward"] > 0 and metrics["invalid_imagined"] == 0
+    assert any(np.any(a != b) for a, b in zip(jax.tree.leaves(untrained), jax.tree.leaves(trained), strict=True))
+    assert action.shape == (NUM, 2) and np.max(np.abs(action)) <= 1
+
+
+def test_only_exported_names_are_used():
+    # by this file, and nothing is imported from a module of the package
+    nodes = list(ast.walk(ast.parse(pathlib.Path(__file__).read_text())))
+    attributes = [node for node in nodes if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name)]
+    used = {node.attr for node in attributes if node.value.id == "jx"} - {"__all__"}
+    assert {"make_imagination", "rollout"} <= used <= set(jx.__all__)
+    assert not [node for node in nodes if isinstance(node, ast.ImportFrom)]

@@ -16,6 +16,7 @@ from jaxplore.learners.ddqn import DDQNConfig, make_ddqn
 from jaxplore.learners.sac import SACConfig, make_sac
 from jaxplore.methods import METHODS
 from jaxplore.types import Transition
+from tests.jaxplore import programs
 
 FLAG = jnp.zeros((), bool)
 
@@ -23,7 +24,13 @@ FLAG = jnp.zeros((), bool)
 def experience_of(obs, reward):
     """Real data `obs [T, O]` with `reward [T]`, each observation its own successor, and normalisers fitted to it."""
     count = len(obs)
-    rows = Transition(obs, jnp.zeros((count, 1)), reward, obs, jnp.zeros(count, bool), jnp.zeros(count, bool))
+    flags = np.zeros(count, bool)
+    return experience_in(Transition(obs, np.zeros((count, 1), np.float32), reward, obs, flags, flags))
+
+
+@jax.jit
+def experience_in(rows):
+    count, obs = len(rows.reward), rows.obs
     data = replay.add(replay.init(jax.tree.map(lambda x: x[0], rows), count), rows)
     normalizers = dynamics.update_normalizers(dynamics.init_normalizers(obs.shape[1], 1), rows, jnp.ones(count, bool))
     return Experience((), data, jnp.int32(count), normalizers, obs[0])
@@ -50,24 +57,24 @@ def make_spy(batch_size=256):
 def test_the_learner_sees_real_data_and_its_own_reward(normalize_obs):
     # observations of 5 +- 2: 0 on average if normalised, else 5; 256 draws a batch, 7 batches
     behaviour = make_model_free(make_spy(), 3, 1, ModelFreeConfig(updates_per_round=7, normalize_obs=normalize_obs))
-    obs = 5 + 2 * jax.random.normal(jax.random.key(0), (100, 3))
-    experience = experience_of(obs, jnp.full(100, -0.25))
-    state, metrics = jax.jit(behaviour.improve)(jax.random.key(1), behaviour.init(jax.random.key(2)), experience)
+    obs = np.asarray(5 + 2 * np.random.default_rng(0).normal(size=(100, 3)), np.float32)
+    experience, improve = experience_of(obs, np.full(100, -0.25, np.float32)), jax.jit(behaviour.improve)
+    state, metrics = improve(jax.random.key(1), behaviour.init(jax.random.key(2)), experience)
     want = 0.0 if normalize_obs else 5.0
-    np.testing.assert_allclose(state / 7, [1, want, want, -0.25], atol=0.25)
+    np.testing.assert_allclose(np.asarray(state) / 7, [1, want, want, -0.25], atol=0.25)
     assert float(metrics["last"]) == -0.25
     # a second round goes on from the first
-    state, _ = behaviour.improve(jax.random.key(3), state, experience)
+    state, _ = improve(jax.random.key(3), state, experience)
     assert state[0] == 14
-    seen = (obs[0, 0] - jnp.mean(obs[:, 0])) / jnp.std(obs[:, 0]) if normalize_obs else obs[0, 0]
-    action = behaviour.act(jax.random.key(4), behaviour.actor(state), experience.normalizers, obs[0])
+    seen = (obs[0, 0] - np.mean(obs[:, 0])) / np.std(obs[:, 0]) if normalize_obs else obs[0, 0]
+    action = jax.jit(behaviour.act)(jax.random.key(4), behaviour.actor(state), experience.normalizers, obs[0])
     np.testing.assert_allclose(action, [100 + 14 + seen], rtol=1e-5)
 
 
 def test_batches_are_new_at_each_update_and_in_each_round():
     # the mean reward of 8 rows drawn from 100 different ones hardly ever comes twice
     behaviour = make_model_free(make_spy(8), 3, 1, ModelFreeConfig(updates_per_round=1))
-    experience = experience_of(jnp.ones((100, 3)), jnp.arange(100.0) ** 2)
+    experience = experience_of(np.ones((100, 3), np.float32), np.arange(100, dtype=np.float32) ** 2)
     improve, state = jax.jit(behaviour.improve), behaviour.init(jax.random.key(0))
     drawn = [float(improve(jax.random.key(i), state, experience)[1]["last"]) for i in range(5)]
     assert len(set(drawn)) == 5
@@ -77,7 +84,7 @@ def test_batches_are_new_at_each_update_and_in_each_round():
 
 
 def test_acting_greedily_is_a_setting():
-    experience = experience_of(jnp.ones((4, 3)), jnp.zeros(4))
+    experience = experience_of(np.ones((4, 3), np.float32), np.zeros(4, np.float32))
     for greedy, want in ((True, 1.0), (False, 101.0)):
         behaviour = make_model_free(make_spy(), 3, 1, ModelFreeConfig(act_greedily=greedy, normalize_obs=False))
         assert behaviour.act(jax.random.key(0), jnp.float32(0), experience.normalizers, jnp.ones(3)) == want
@@ -87,7 +94,7 @@ def test_any_learner_fits():
     # SAC, as shapes only: its state and metrics come out as they went in
     sac = make_sac(3, 1, SACConfig(hidden=(4,), batch_size=8))
     behaviour = make_model_free(sac, 3, 1)
-    experience = experience_of(jnp.ones((20, 3)), jnp.zeros(20))
+    experience = experience_of(np.ones((20, 3), np.float32), np.zeros(20, np.float32))
     state = jax.eval_shape(behaviour.init, jax.random.key(0))
     after, metrics = jax.eval_shape(behaviour.improve, jax.random.key(1), state, experience)
     assert jax.tree.map(lambda x: x.shape, after) == jax.tree.map(lambda x: x.shape, state)
@@ -103,10 +110,16 @@ def ddqn_act(sizes, normalize_obs, epsilon=0.0):
     config = ExplorationConfig(ddqn=ddqn, model_free=ModelFreeConfig(normalize_obs=normalize_obs))
     method = METHODS["ddqn"]
     behaviour = method.behaviour(sizes, config, method.belief(sizes, config), method.reward(config).score)
-    learner, state = make_ddqn(5, 3, ddqn), behaviour.init(jax.random.key(0))
-    experience = experience_of(jnp.linspace(20.0, 80.0, 50).reshape(10, 5), jnp.zeros(10))
-    got = behaviour.act(jax.random.key(1), behaviour.actor(state), experience.normalizers, jnp.eye(5))
-    return jnp.argmax(got, axis=-1), jnp.argmax(learner.act_greedily(learner.actor(state), jnp.eye(5)), axis=-1)
+    obs = np.linspace(20.0, 80.0, 50, dtype=np.float32).reshape(10, 5)
+    learner, experience = make_ddqn(5, 3, ddqn), experience_of(obs, np.zeros(10, np.float32))
+
+    @jax.jit
+    def both(key, obs):
+        state = behaviour.init(key)
+        got = behaviour.act(jax.random.key(1), behaviour.actor(state), experience.normalizers, obs)
+        return jnp.argmax(got, axis=-1), jnp.argmax(learner.act_greedily(learner.actor(state), obs), axis=-1)
+
+    return both(jax.random.key(0), np.eye(5, dtype=np.float32))
 
 
 def test_one_hot_observations_are_never_normalised():
@@ -180,12 +193,15 @@ def test_ddqn_learns_a_short_chain():
         explored, _ = explorer.improve(learn_key, explored, see(next_state), t + 1)
         return (explored, jnp.where(ends, 1, next_state)), None
 
-    run = jax.jit(lambda key: jax.lax.scan(step, (explorer.init(key), jnp.int32(1)), jnp.arange(2000))[0][0])
-    params = run(jax.random.key(0)).behaviour.params
-    hidden = jnp.tanh(jnp.eye(NUM_STATES) @ params["hidden_0"]["kernel"] + params["hidden_0"]["bias"][None])
-    q = hidden @ params["output"]["kernel"] + params["output"]["bias"][None]
+    @programs.compiled
+    def run(key):
+        return jax.lax.scan(step, (explorer.init(key), jnp.int32(1)), jnp.arange(2000))[0][0].behaviour.params
+
+    params = jax.device_get(run(jax.random.key(0)))
+    hidden = np.tanh(np.eye(NUM_STATES) @ params["hidden_0"]["kernel"] + params["hidden_0"]["bias"])
+    q = hidden @ params["output"]["kernel"] + params["output"]["bias"]
     np.testing.assert_allclose(q, chain_values(), atol=0.3)
-    np.testing.assert_array_equal(jnp.argmax(q, axis=1), 1 - FLIPS)
+    np.testing.assert_array_equal(np.argmax(q, axis=1), 1 - FLIPS)
 
 
 def test_bad_settings_are_refused():

@@ -1,4 +1,4 @@
-"""Random network distillation: what is seen stops being new, what is not stays so, and who learns from what when."""
+"""Random network distillation in rounds: who learns from what when, and what is reported of it."""
 
 import jax
 import jax.numpy as jnp
@@ -7,73 +7,19 @@ import pytest
 
 from jaxplore import dynamics, replay
 from jaxplore.behaviours import Experience, ReactiveConfig, make_rnd_learner, make_rnd_ppo
+from jaxplore.behaviours.distillation import newest
 from jaxplore.config import ExplorationConfig, Sizes
+from jaxplore.exploration import make_explorer
 from jaxplore.learners.base import Learner
 from jaxplore.learners.ppo import PPOConfig
+from jaxplore.learners.sac import SACConfig
 from jaxplore.methods import METHODS
-from jaxplore.signals.distillation import RNDConfig, init_scale, make_rnd, update_scale
+from jaxplore.signals.distillation import RNDConfig
 from jaxplore.types import Transition
+from tests.jaxplore import distillation
 
 SMALL = RNDConfig(hidden=(16,), features=8, lr=3e-3)
 
-
-def test_the_bonus_is_the_mean_squared_error_over_features():
-    # against both networks written out: leaky ReLU with slope 0.01, two more layers in the predictor, clip at 5
-    rnd = make_rnd(3, SMALL)
-    state = jax.jit(rnd.init)(jax.random.key(0))
-    obs = jnp.array([[0.5, -1.0, 2.0], [0.5, -9.0, 7.0]])
-
-    def run(params, x):
-        for name in sorted(name for name in params if name.startswith("hidden_")):
-            x = x @ params[name]["kernel"] + params[name]["bias"][None]
-            x = jnp.where(x > 0, x, 0.01 * x)
-        return x @ params["output"]["kernel"] + params["output"]["bias"][None]
-
-    assert [len(state.target), len(state.predictor)] == [2, 4]
-    seen = jnp.clip(obs, -5, 5)
-    want = jnp.mean((run(state.target, seen) - run(state.predictor, seen)) ** 2, axis=-1)
-    np.testing.assert_allclose(rnd.error(state, obs), want, rtol=1e-5)
-    np.testing.assert_allclose(rnd.error(state, obs[1]), want[1], rtol=1e-5)
-    # orthogonal, gain sqrt 2
-    kernel = state.target["output"]["kernel"]
-    np.testing.assert_allclose(kernel.T @ kernel, 2 * np.eye(8), atol=1e-5)
-
-
-def test_the_error_falls_on_what_is_seen_and_not_on_what_is_not():
-    # 400 steps on a cloud around (1, 0, 0); one around (-1, 1, 0) is never shown, nor one whose weights are 0
-    rnd = make_rnd(3, SMALL)
-    centres = jnp.array([[1.0, 0.0, 0.0], [-1.0, 1.0, 0.0]])
-    clouds = centres[:, None] + 0.2 * jax.random.normal(jax.random.key(1), (2, 64, 3))
-    weights = jnp.concatenate([jnp.ones(64), jnp.zeros(64)])
-
-    def step(state, _):
-        return rnd.update(state, clouds.reshape(128, 3), weights)[0], None
-
-    first = jax.jit(rnd.init)(jax.random.key(0))
-    last = jax.jit(lambda state: jax.lax.scan(step, state, length=400)[0])(first)
-    seen, unseen = (np.asarray(jnp.mean(rnd.error(last, c)) / jnp.mean(rnd.error(first, c))) for c in clouds)
-    assert seen < 0.02
-    assert unseen > 10 * seen
-    jax.tree.map(np.testing.assert_array_equal, last.target, first.target)
-
-
-def test_rewards_are_scaled_by_the_spread_of_their_discounted_sum_in_time():
-    # rewards come in several calls, some left out; the sums run forward in time and are not centred
-    rng = np.random.default_rng(0)
-    rewards, valid = rng.uniform(size=50), rng.uniform(size=50) < 0.7
-    scale = init_scale()
-    assert float(scale.std) == 1.0
-    for part in (slice(0, 20), slice(20, 50)):
-        scale = update_scale(scale, jnp.asarray(rewards[part], jnp.float32), jnp.asarray(valid[part]), 0.9)
-    running, sums = 0.0, []
-    for reward in rewards[valid]:
-        running = 0.9 * running + reward
-        sums.append(running)
-    assert float(scale.running) == pytest.approx(running, rel=1e-5)
-    assert float(scale.std) == pytest.approx(np.std(sums), rel=1e-4)
-
-
-# In rounds.
 
 OBS, ACTION, PER_ROUND, WARM_UP = 2, 1, 3, 4
 PPO = PPOConfig(hidden=(4,), rollout_steps=8, minibatch_size=4, epochs=1)
@@ -81,34 +27,54 @@ PPO = PPOConfig(hidden=(4,), rollout_steps=8, minibatch_size=4, epochs=1)
 
 def rows(first, count):
     """Transitions number `first` on: their observations tell their number."""
-    obs = jnp.stack([jnp.arange(first, first + count, dtype=jnp.float32), jnp.zeros(count)], axis=1)
-    flags = jnp.zeros(count, bool)
-    return Transition(obs, jnp.sin(obs[:, :1]), jnp.zeros(count), obs + 1, flags, flags)
+    number = np.arange(first, first + count, dtype=np.float32)
+    obs, flags = np.stack([number, np.zeros(count, np.float32)], axis=1), np.zeros(count, bool)
+    return Transition(obs, np.sin(obs[:, :1]), np.zeros(count, np.float32), obs + 1, flags, flags)
 
 
-def play(behaviour, rounds, capacity):
-    """`(states, metrics)` after the random steps and after each round of `PER_ROUND` steps."""
+@jax.jit
+def take_in(data, normalizers, fresh):
+    valid = jnp.ones(fresh.reward.shape[0], bool)
+    return replay.add(data, fresh), dynamics.update_normalizers(normalizers, fresh, valid)
+
+
+def rounds(num, capacity):
+    """The `Experience` after the random steps and after each of `num` rounds of `PER_ROUND` steps."""
     data = replay.init(jax.tree.map(lambda leaf: leaf[0], rows(0, 1)), capacity)
-    normalizers = dynamics.init_normalizers(OBS, ACTION)
-    improve, state, num, seen = jax.jit(behaviour.improve), behaviour.init(jax.random.key(0)), 0, []
-    for i in range(rounds + 1):
-        count = PER_ROUND if i else WARM_UP
-        fresh = rows(num, count)
-        data, num = replay.add(data, fresh), num + count
-        normalizers = dynamics.update_normalizers(normalizers, fresh, jnp.ones(count, bool))
-        state, metrics = improve(
-            jax.random.key(i), state, Experience((), data, jnp.int32(num), normalizers, fresh.next_obs[-1])
-        )
-        seen.append((state, metrics, normalizers))
+    normalizers, taken = dynamics.init_normalizers(OBS, ACTION), 0
+    for i in range(num + 1):
+        fresh = rows(taken, PER_ROUND if i else WARM_UP)
+        data, normalizers = take_in(data, normalizers, fresh)
+        taken += len(fresh.reward)
+        yield Experience((), data, np.int32(taken), normalizers, fresh.next_obs[-1])
+
+
+def play(behaviour, num, capacity):
+    """`(state, metrics, normalizers)` after the random steps and after each round."""
+    improve, state, seen = jax.jit(behaviour.improve), jax.jit(behaviour.init)(jax.random.key(0)), []
+    for i, experience in enumerate(rounds(num, capacity)):
+        state, metrics = improve(jax.random.key(i), state, experience)
+        seen.append((*jax.device_get((state, metrics)), experience.normalizers))
     return seen
 
 
 @pytest.mark.parametrize("capacity", [100, 7])
-def test_ppo_learns_every_so_many_steps_from_the_steps_of_its_own_policy(capacity):
-    # 4 random steps, then 3 a round, 8 an update: after 9, 18, 24 of its own, with no random ones among them, whether
-    # or not the replay has come round; statistics and policy stand still in between
+def test_what_a_round_brought_is_found_in_the_replay(capacity):
+    # by their numbers, whether or not the replay has wrapped around; nothing the first time
+    find, position = jax.jit(newest, static_argnums=2), np.int32(-1)
+    for i, experience in enumerate(rounds(8, capacity)):
+        found, valid, position = find(experience, position, PER_ROUND)
+        assert np.sum(valid) == (PER_ROUND if i else 0)
+        want = WARM_UP + PER_ROUND * (i - 1) + np.arange(PER_ROUND)
+        np.testing.assert_array_equal(found.obs[:, 0][valid], want if i else [])
+        assert int(position) == (WARM_UP + PER_ROUND * i) % capacity
+
+
+def test_ppo_learns_every_so_many_steps_from_the_steps_of_its_own_policy():
+    # 4 random steps, then 3 a round, 8 an update: after 9, 18, 24 of its own, with no random ones among them, though
+    # the replay wraps around; statistics and policy stand still in between
     behaviour = make_rnd_ppo(OBS, ACTION, PER_ROUND, WARM_UP, PPO, SMALL)
-    seen = play(behaviour, 8, capacity)
+    seen = play(behaviour, 8, 7)
     assert [int(metrics["updated"]) for _, metrics, _ in seen] == [0, 0, 0, 1, 0, 0, 1, 0, 1]
     assert [int(state.num) for state, _, _ in seen] == [0, 3, 6, 0, 3, 6, 0, 3, 0]
     np.testing.assert_array_equal(seen[2][0].steps.obs[:6, 0], WARM_UP + np.arange(6))
@@ -126,13 +92,16 @@ def test_ppo_learns_every_so_many_steps_from_the_steps_of_its_own_policy(capacit
 
 def test_probabilities_are_those_under_the_policy_that_acted():
     # with one gradient step per update the ratio is 1: nothing is clipped, no divergence, though the statistics of all
-    # data have moved meanwhile
+    # data have moved meanwhile. Updates come when they do in a replay that wraps around
     config = PPOConfig(hidden=(4,), rollout_steps=8, minibatch_size=8, epochs=1)
-    seen = play(make_rnd_ppo(OBS, ACTION, PER_ROUND, WARM_UP, config, SMALL), 6, 100)
+    behaviour = make_rnd_ppo(OBS, ACTION, PER_ROUND, WARM_UP, config, SMALL)
+    seen = play(behaviour, 6, 100)
+    assert [int(metrics["updated"]) for _, metrics, _ in seen] == [0, 0, 0, 1, 0, 0, 1]
+    assert [int(state.num) for state, _, _ in seen] == [0, 3, 6, 0, 3, 6, 0]
+    np.testing.assert_array_equal(seen[5][0].steps.obs[:6, 0], WARM_UP + 9 + np.arange(6))
     for i in (3, 6):
         assert float(seen[i][1]["kl"]) == pytest.approx(0.0, abs=1e-6)
         assert float(seen[i][1]["clipped"]) == 0.0
-    behaviour = make_rnd_ppo(OBS, ACTION, PER_ROUND, WARM_UP, config, SMALL)
     state, _, normalizers = seen[5]
     one, other = (behaviour.act(jax.random.key(0), behaviour.actor(state), n, jnp.ones(2)) for n in (normalizers, None))
     np.testing.assert_array_equal(one, other)
@@ -145,11 +114,9 @@ def test_a_learner_gets_the_bonus_of_successors_as_reward(normalize_reward):
     def update(key, state, batch):
         return batch, {"mean": jnp.mean(batch.reward)}
 
-    batch = Transition(
-        jnp.zeros((8, OBS)), jnp.zeros((8, ACTION)), jnp.zeros(8), jnp.zeros((8, OBS)), *[jnp.zeros(8, bool)] * 2
-    )
+    batch = rows(0, 8)
     spy = Learner(
-        init=lambda key: batch,
+        init=lambda key: jax.tree.map(jnp.asarray, batch),
         actor=lambda state: (),
         act=lambda key, actor, obs: obs[..., :1],
         act_greedily=lambda actor, obs: -obs[..., :1],
@@ -158,22 +125,52 @@ def test_a_learner_gets_the_bonus_of_successors_as_reward(normalize_reward):
     )
     config = ReactiveConfig(updates=2, normalize_reward=normalize_reward)
     behaviour = make_rnd_learner(spy, OBS, PER_ROUND, config, SMALL)
-    seen, rnd = play(behaviour, 3, 100), make_rnd(OBS, SMALL)
-    jax.tree.map(np.testing.assert_array_equal, seen[0][0].rnd, behaviour.init(jax.random.key(0)).rnd)
+    seen = play(behaviour, 3, 100)
+    jax.tree.map(np.testing.assert_array_equal, seen[0][0].rnd, jax.jit(behaviour.init)(jax.random.key(0)).rnd)
     for state, metrics, normalizers in seen[1:]:
         shown = state.learner
-        mean, std = normalizers.obs.mean[None], normalizers.obs.std[None]
+        mean, std = (np.asarray(leaf)[None] for leaf in (normalizers.obs.mean, normalizers.obs.std))
         np.testing.assert_allclose(shown.obs * std + mean + 1, shown.next_obs * std + mean, atol=1e-4)
-        errors, spread = rnd.error(state.rnd, shown.next_obs), float(state.scale.std)
+        errors, spread = distillation.error(state.rnd, shown.next_obs), float(state.scale.std)
         if normalize_reward:
             # the successors of all rows so far; 1,024 draws of them have their spread within a tenth
             held = np.arange(1.0, state.position + 1)
-            every = jnp.stack([jnp.asarray(held), jnp.ones(len(held))], axis=1)
-            spread = float(jnp.std(rnd.error(state.rnd, (every - mean) / std)))
+            every = np.stack([held, np.ones(len(held))], axis=1)
+            spread = float(np.std(distillation.error(state.rnd, (every - mean) / std)))
         np.testing.assert_allclose(shown.reward, errors / spread, rtol=0.1 if normalize_reward else 1e-4)
         assert float(metrics["intrinsic_reward"]) > 0
     before, after = (np.asarray(state.rnd.predictor["output"]["kernel"]) for state, _, _ in seen[:2])
     assert not np.array_equal(before, after)
+
+
+@pytest.mark.parametrize("name", ["rnd", "rnd_sac"])
+def test_the_distillation_error_of_new_transitions_is_reported(name):
+    # by hand, of valid rows alone, on observations normalised as the predictor sees them: by all data, or with PPO once
+    # it has started by the statistics of its last update, here mean 0 and standard deviation 1
+    config = ExplorationConfig(
+        steps_per_round=PER_ROUND,
+        data_capacity=20,
+        ppo=PPO,
+        rnd=SMALL,
+        sac=SACConfig(hidden=(4,), batch_size=4),
+    )
+    explorer = make_explorer(METHODS[name], Sizes(OBS, ACTION), config)
+    taken, valid = rows(0, 12), np.arange(7) % 3 != 1
+    start = jax.jit(lambda key: explorer.observe(explorer.init(key), taken, jnp.ones(12, bool)))
+    state, assess, new = start(jax.random.key(0)), jax.jit(explorer.assess), rows(20, 7)
+
+    def reported_and_wanted(state, mean, std):
+        want = distillation.error(jax.device_get(state.behaviour.rnd), (new.next_obs[valid] - mean) / std)
+        got = assess(jax.random.key(1), state, new, valid)
+        assert got.keys() == {"intrinsic_reward", "intrinsic_reward_p95"} and np.min(want) > 0
+        return [float(value) for value in got.values()], [np.mean(want), np.percentile(want, 95)]
+
+    # a constant entry has the smallest standard deviation that is divided by
+    std = np.maximum(np.std(taken.obs, axis=0), 1e-3)
+    np.testing.assert_allclose(*reported_and_wanted(state, np.mean(taken.obs, axis=0), std), rtol=1e-4)
+    if name == "rnd":
+        state = state.replace(behaviour=state.behaviour.replace(position=jnp.int32(12)))
+        np.testing.assert_allclose(*reported_and_wanted(state, 0.0, 1.0), rtol=1e-4)
 
 
 def test_refusals():

@@ -19,6 +19,7 @@ from jaxplore.dynamics import ONE_HOT, DynamicsConfig, Prediction
 from jaxplore.exploration import make_explorer
 from jaxplore.methods import METHODS
 from jaxplore.types import Transition
+from tests.jaxplore import programs
 
 NUM_STATES, NUM_ACTIONS, NUM_MODELS = 4, 2, 3
 SIZES = Sizes(NUM_STATES, NUM_ACTIONS, discrete=True, one_hot_obs=True)
@@ -29,7 +30,7 @@ def chain(num_states=NUM_STATES):
     """All transitions of a chain without flips: `(obs, action, next_obs)`, one-hot, states first."""
     states, actions = np.divmod(np.arange(2 * num_states), 2)
     after = np.clip(states + np.where(actions == 0, 1, -1), 0, num_states - 1)
-    return [jnp.eye(n)[i] for n, i in ((num_states, states), (2, actions), (num_states, after))]
+    return [np.eye(n, dtype=np.float32)[i] for n, i in ((num_states, states), (2, actions), (num_states, after))]
 
 
 def known_belief(models_agree_in):
@@ -38,7 +39,7 @@ def known_belief(models_agree_in):
     Only their first answer to `[obs, action]` is kept: no parameters, nothing to learn.
     """
     obs, action, after = chain()
-    pairs = jnp.concatenate([obs, action], axis=1)
+    pairs, after = jnp.asarray(np.hstack([obs, action])), jnp.asarray(after)
 
     def predict(models, inputs):
         row = jnp.argmax(inputs @ pairs.T, axis=1)
@@ -49,8 +50,7 @@ def known_belief(models_agree_in):
     return Belief(lambda key: (), lambda key, state, *rest: (state, {}), lambda *args: (), predict, ONE_HOT, NUM_MODELS)
 
 
-def experience(models=None):
-    models = jnp.arange(NUM_MODELS) if models is None else models
+def experience(models):
     flag = jnp.zeros((), bool)
     row = Transition(jnp.zeros(NUM_STATES), jnp.zeros(NUM_ACTIONS), jnp.zeros(()), jnp.zeros(NUM_STATES), flag, flag)
     return Experience(models, replay.init(row, 8), jnp.int32(0), NORMALIZERS, jnp.eye(NUM_STATES)[1])
@@ -60,15 +60,17 @@ def variance(prediction, delta, normalizers):
     return rewards.variance(prediction)
 
 
-def tree_search(belief, **config):
-    return make_tree_search(belief, variance, NUM_STATES, NUM_ACTIONS, MCTSConfig(**config))
+def improved(belief, models=None, **config):
+    """`(behaviour, state, metrics)` after a round."""
+    behaviour = make_tree_search(belief, variance, NUM_STATES, NUM_ACTIONS, MCTSConfig(**config))
+    one_round = jax.jit(lambda key, models: behaviour.improve(key, behaviour.init(key), experience(models)))
+    return behaviour, *one_round(jax.random.key(0), np.arange(NUM_MODELS) if models is None else models)
 
 
 def test_tables_hold_what_the_models_say():
     # states 0 to 2 are known: their chain moves and utility 0. In state 3 three sure models differ: each of three
     # outputs has variance 1/3 - 1/9, in all 2/3
-    behaviour = tree_search(known_belief([0, 1, 2]))
-    state, metrics = jax.jit(behaviour.improve)(jax.random.key(0), behaviour.init(jax.random.key(0)), experience())
+    _, state, metrics = improved(known_belief([0, 1, 2]))
     moves = np.array([[1, 0], [2, 0], [3, 1]])
     np.testing.assert_array_equal(state.next_state[:, :3], np.broadcast_to(moves, (NUM_MODELS, 3, 2)))
     np.testing.assert_array_equal(state.next_state[:, 3], [[0, 0], [1, 1], [2, 2]])
@@ -80,17 +82,15 @@ def test_tables_hold_what_the_models_say():
 
 def test_identical_models_leave_nothing_to_explore():
     # three times model 2: variance 0 everywhere, all agree
-    behaviour = tree_search(known_belief([]))
-    state, metrics = behaviour.improve(jax.random.key(0), behaviour.init(jax.random.key(0)), experience(jnp.full(3, 2)))
+    _, state, metrics = improved(known_belief([]), models=np.full(3, 2))
     np.testing.assert_array_equal(state.utility, np.zeros((NUM_STATES, NUM_ACTIONS)))
     assert float(metrics["agreement"]) == 1.0
 
 
 def test_it_goes_where_the_models_differ():
     # they differ in state 3 alone: from 0, 1 and 2 it is straight ahead, action 0, within 3 steps; any leading axes
-    behaviour = tree_search(known_belief([0, 1, 2]), horizon=4, num_iterations=40)
-    state, _ = behaviour.improve(jax.random.key(0), behaviour.init(jax.random.key(0)), experience())
-    obs = jnp.tile(jnp.eye(NUM_STATES)[:3], (5, 1, 1))
+    behaviour, state, _ = improved(known_belief([0, 1, 2]), horizon=4, num_iterations=40)
+    obs = np.tile(np.eye(NUM_STATES, dtype=np.float32)[:3], (5, 1, 1))
     actions = jax.jit(behaviour.act)(jax.random.key(1), behaviour.actor(state), NORMALIZERS, obs)
     np.testing.assert_array_equal(actions, np.tile([1.0, 0.0], (5, 3, 1)))
 
@@ -99,8 +99,7 @@ def test_sampled_models_go_by_their_probabilities():
     # one model whose answer is (1/2, 1/4, 1/4, 0) everywhere, asked at 8 pairs, 3 times over: multinomial counts
     chance = jnp.array([0.5, 0.25, 0.25, 0.0])
     predict = lambda models, inputs: Prediction(jnp.tile(chance, (NUM_MODELS, len(inputs), 1)))  # noqa: E731
-    behaviour = tree_search(known_belief([])._replace(predict=predict), model_step="sample")
-    state, _ = behaviour.improve(jax.random.key(0), behaviour.init(jax.random.key(0)), experience())
+    _, state, _ = improved(known_belief([])._replace(predict=predict), model_step="sample")
     drawn = np.asarray(state.next_state)
     assert drawn.shape == (DRAWS_PER_MODEL * NUM_MODELS, NUM_STATES, NUM_ACTIONS)
     share = np.bincount(drawn.ravel(), minlength=4) / drawn.size
@@ -114,7 +113,7 @@ def fitted():
     backward in the first 3; so one pair of 8 is not in the data. What 50 networks of each say: `[16, 50, 8, 4]`.
     """
     obs, action, after = (leaf[:7] for leaf in chain())
-    flags, zeros = jnp.zeros(7, bool), jnp.zeros(7)
+    flags, zeros = np.zeros(7, bool), np.zeros(7, np.float32)
     belief = make_generator_belief(
         NUM_STATES,
         NUM_ACTIONS,
@@ -126,10 +125,12 @@ def fitted():
     predict = belief.predict
     assert predict is not None
     row = Transition(obs[0], action[0], zeros[0], obs[0], flags[0], flags[0])
-    data = replay.add(replay.init(row, 8), Transition(obs, action, zeros, after, flags, flags))
-    pairs = ONE_HOT.inputs(NORMALIZERS, *chain()[:2])
+    data = jax.jit(lambda row, rows: replay.add(replay.init(row, 8), rows))(
+        row, Transition(obs, action, zeros, after, flags, flags)
+    )
+    pairs = jnp.asarray(np.hstack(chain()[:2]))
 
-    @jax.jit
+    @programs.compiled
     @jax.vmap
     def answers(key):
         def update(i, state):
@@ -138,27 +139,27 @@ def fitted():
         state = jax.lax.fori_loop(0, 800, update, belief.init(key))
         return predict(belief.sample(jax.random.fold_in(key, 800), state, 50), pairs).mean
 
-    return answers(jax.random.split(jax.random.key(0), 16))
+    return jax.device_get(answers(jax.random.split(jax.random.key(0), 16)))
 
 
 def variances(fitted):
     """Of each generator and pair, `[16, 8]`."""
-    return jax.vmap(lambda means: rewards.variance(Prediction(means)))(fitted)
+    return np.asarray(jax.jit(jax.vmap(lambda means: rewards.variance(Prediction(means))))(fitted))
 
 
 def test_predictions_are_probabilities(fitted):
     # over states they sum to one, none is negative, and the variance of such is below 1
-    np.testing.assert_allclose(jnp.sum(fitted, axis=-1), 1.0, rtol=1e-5)
-    assert float(jnp.min(fitted)) >= 0.0
-    assert float(jnp.max(variances(fitted))) < 1.0
+    np.testing.assert_allclose(np.sum(fitted, axis=-1), 1.0, rtol=1e-5)
+    assert np.min(fitted) >= 0.0
+    assert np.max(variances(fitted)) < 1.0
 
 
 def test_fit_learns_the_chain_and_is_least_sure_of_what_it_has_not_seen(fitted):
     # nearly all networks put the 7 pairs in the data where they belong (chance is 0.25); the eighth has the largest
     # variance. Means over 16 generators: of a single one either hangs on rounding, so on the CPU
     _, _, after = chain()
-    likely = ONE_HOT.next_obs(NORMALIZERS, jnp.zeros(()), fitted[:, :, :7])
-    assert float(jnp.mean(jnp.sum(likely * after[None, None, :7], axis=-1))) > 0.95
+    likely = np.asarray(ONE_HOT.next_obs(NORMALIZERS, np.zeros(()), fitted[:, :, :7]))
+    assert np.mean(np.sum(likely * after[None, None, :7], axis=-1)) > 0.95
     spread = np.mean(variances(fitted), axis=0)
     assert np.argmax(spread) == 7 and spread[7] > 3 * spread[:7].mean()
 
@@ -166,14 +167,19 @@ def test_fit_learns_the_chain_and_is_least_sure_of_what_it_has_not_seen(fitted):
 def test_a_network_that_is_sure_and_wrong_learns_by_cross_entropy():
     # logits 20 above all others for the wrong one of 40 states: squared error's own gradient is 1e-7 and less; that of
     # 0.5 |y - p|^2 through `outputs` is p - y, which cross-entropy has
-    logits, target = jnp.full(40, -10.0).at[3].set(10.0), jnp.eye(40)[5]
+    @jax.jit
+    def gradients(logits, target):
+        def squared_error(outputs):
+            return jax.grad(lambda last: 0.5 * jnp.sum((outputs(last) - target) ** 2))(logits)
 
-    def gradient(outputs):
-        return jax.grad(lambda last: 0.5 * jnp.sum((outputs(last) - target) ** 2))(logits)
+        cross_entropy = jax.grad(lambda last: -jnp.sum(target * jax.nn.log_softmax(last)))(logits)
+        return squared_error(jax.nn.softmax), squared_error(ONE_HOT.outputs), cross_entropy
 
-    assert float(jnp.max(jnp.abs(gradient(jax.nn.softmax)))) < 1e-6
-    cross_entropy = jax.grad(lambda last: -jnp.sum(target * jax.nn.log_softmax(last)))(logits)
-    np.testing.assert_allclose(gradient(ONE_HOT.outputs), cross_entropy, atol=1e-6)
+    logits, target = np.full(40, -10.0, np.float32), np.eye(40, dtype=np.float32)[5]
+    logits[3] = 10.0
+    plain, ours, cross_entropy = gradients(logits, target)
+    assert np.max(np.abs(plain)) < 1e-6
+    np.testing.assert_allclose(ours, cross_entropy, atol=1e-6)
     np.testing.assert_array_equal(ONE_HOT.outputs(logits), jax.nn.softmax(logits))
 
 
@@ -193,10 +199,12 @@ def test_warm_up_and_the_random_method_choose_uniformly():
     # one-hot, each choice half of the time, within 5 standard deviations of 1,000
     explorer = make_explorer(METHODS["random"], SIZES, SMALL)
     actor = explorer.actor(explorer.init(jax.random.key(0)))
-    obs = jnp.tile(jnp.eye(NUM_STATES)[1], (1000, 1))
-    for actions in (explorer.act(jax.random.key(1), actor, obs), explorer.act_uniformly(jax.random.key(2), obs)):
+    obs = np.tile(np.eye(NUM_STATES, dtype=np.float32)[1], (1000, 1))
+    act, act_uniformly = jax.jit(explorer.act), jax.jit(explorer.act_uniformly)
+    for actions in (act(jax.random.key(1), actor, obs), act_uniformly(jax.random.key(2), obs)):
+        actions = np.asarray(actions)
         assert np.array_equal(np.sort(actions, axis=1), np.tile([0.0, 1.0], (1000, 1)))
-        assert abs(float(jnp.mean(actions[:, 0])) - 0.5) < 5 * 0.5 / np.sqrt(1000)
+        assert abs(np.mean(actions[:, 0]) - 0.5) < 5 * 0.5 / np.sqrt(1000)
 
 
 def test_what_does_not_fit_is_refused():

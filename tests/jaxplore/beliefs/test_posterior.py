@@ -14,6 +14,7 @@ import pytest
 
 from jaxplore.beliefs.generator import Generator, GeneratorConfig, make_generator
 from jaxplore.beliefs.svgd import SVGDConfig, make_amortized_svgd
+from tests.jaxplore import programs
 
 
 @pytest.fixture
@@ -36,12 +37,12 @@ def linear_apply(params, inputs):
     return inputs @ params["kernel"]
 
 
-def regression(num_data: int, size: int, std: float = 0.2, seed: int = 0) -> tuple[jax.Array, jax.Array]:
+def regression(num_data: int, size: int, std: float = 0.2, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     """Inputs `[N, p]` and targets `[N, 1]` of a linear regression with noise of the given standard deviation."""
     rng = np.random.default_rng(seed)
     x = rng.normal(size=(num_data, size))
     y = x @ rng.normal(size=(size, 1)) + std * rng.normal(size=(num_data, 1))
-    return jnp.asarray(x), jnp.asarray(y)
+    return x, y
 
 
 def fit(config, x, y, steps, seeds=4, lr=1e-2, batch_size=None, num_data=None, **kwargs):
@@ -58,6 +59,7 @@ def fit(config, x, y, steps, seeds=4, lr=1e-2, batch_size=None, num_data=None, *
         **kwargs,
     )
     num_data = num_data or len(x)
+    inputs, targets = jnp.asarray(x), jnp.asarray(y)
 
     def one_seed(key):
         def step(carry, scanned):
@@ -67,7 +69,7 @@ def fit(config, x, y, steps, seeds=4, lr=1e-2, batch_size=None, num_data=None, *
             index = slice(None)
             if batch_size:
                 index = jax.random.randint(batch_key, (batch_size,), 0, len(x))
-            state, metrics = posterior.update(update_key, state, x[index], y[index], num_data)
+            state, metrics = posterior.update(update_key, state, inputs[index], targets[index], num_data)
             late = (i >= steps // 2) / (steps - steps // 2)
             covariance = covariance + late * state.eta["w"] @ state.eta["w"].T
             return (state, covariance, mean + late * state.eta["b"]), metrics["likelihood_std"]
@@ -79,7 +81,8 @@ def fit(config, x, y, steps, seeds=4, lr=1e-2, batch_size=None, num_data=None, *
         )
         return covariance, mean, state, stds
 
-    return jax.jit(jax.vmap(one_seed))(jax.random.split(jax.random.key(0), seeds))
+    run = programs.compiled(jax.vmap(one_seed))
+    return jax.device_get(run(jax.random.split(jax.random.key(0), seeds)))
 
 
 def whitened(covariances, exact):
@@ -198,7 +201,9 @@ def test_mlp_generator_finds_a_gaussian_process_posterior():
     y = features(x) @ rng.normal(size=(size, 1)) + std * rng.normal(size=(24, 1))
     grid = np.linspace(-2.0, 2.0, 81)[:, None]
     exact = np.sqrt(np.sum(features(grid) @ exact_covariance(features(x), std, 1.0) * features(grid), axis=1))
-    generator = make_generator({"kernel": jnp.ones((size, 1))}, GeneratorConfig(noise_size=size, init_std="lecun"))
+    generator = make_generator(
+        {"kernel": np.ones((size, 1), np.float32)}, GeneratorConfig(noise_size=size, init_std="lecun")
+    )
 
     def error(**settings):
         config = SVGDConfig(likelihood_std=std, prior="weights", prior_scale=math.sqrt(size / 2), **settings)
@@ -208,12 +213,13 @@ def test_mlp_generator_finds_a_gaussian_process_posterior():
         init_key, steps_key, sample_key = jax.random.split(jax.random.key(0), 3)
         data = jnp.asarray(x, jnp.float32), jnp.asarray(y, jnp.float32)
 
-        @jax.jit
-        def run(state, keys):
-            return jax.lax.scan(lambda s, key: (posterior.update(key, s, *data, 24)[0], None), state, keys)[0]
+        @programs.compiled
+        def run(init_key, keys, sample_key):
+            step = lambda s, key: (posterior.update(key, s, *data, 24)[0], None)  # noqa: E731
+            state = jax.lax.scan(step, posterior.init(init_key), keys)[0]
+            return generator.sample(state.eta, generator.sample_noise(sample_key, 4000))["kernel"][..., 0]
 
-        state = run(posterior.init(init_key), jax.random.split(steps_key, steps))
-        thetas = generator.sample(state.eta, generator.sample_noise(sample_key, 4000))["kernel"][..., 0]
+        thetas = run(init_key, jax.random.split(steps_key, steps), sample_key)
         return np.mean(np.abs(np.log(np.std(np.asarray(thetas) @ features(grid).T, axis=0) / exact)))
 
     assert error(self_weight=0.0, repulsion_points="uniform", repulsion_scale=2.0) < 0.12

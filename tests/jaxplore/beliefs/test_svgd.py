@@ -71,31 +71,31 @@ def test_direction_is_the_double_loop(x64, kernel, outputs, self_weight):
 @pytest.mark.parametrize("kernel", ["rbf", "imq"])
 def test_repulsion_is_the_autodiff_gradient_of_the_kernel(x64, kernel):
     # T1: jax.grad of K with h held constant, summed over j
-    scores, values = map(jnp.asarray, particles())
+    scores, values = particles()
     flat = values.reshape(6, -1)
-    h = jnp.median(squared_distances(flat)[jnp.triu_indices(6, 1)])
+    h = np.median(np.mean((flat[:, None] - flat[None]) ** 2, axis=-1)[np.triu_indices(6, 1)])
 
     def k(a, b):
         scaled = jnp.mean((a - b) ** 2) / h
         return jnp.exp(-scaled) if kernel == "rbf" else (1 + scaled) ** -0.5
 
-    gradients = jax.vmap(lambda a: jax.vmap(lambda b: jax.grad(k, argnums=1)(a, b))(flat))(flat)
+    gradients = jax.jit(jax.vmap(jax.vmap(jax.grad(k, argnums=1), (None, 0)), (0, None)))(flat, flat)
     got = stein_direction(scores, values, SVGDConfig(kernel=kernel)).repulsion
-    np.testing.assert_allclose(got, (jnp.sum(gradients, axis=1) / 6).reshape(values.shape), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(got, (np.sum(gradients, axis=1) / 6).reshape(values.shape), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("kernel", ["rbf", "imq"])
 def test_repulsion_pushes_outwards_and_moves_no_mean(x64, kernel):
     # T2: sum_i rep_i = 0 and <rep, F - mean> > 0 (3 of 5 public codes have the other sign)
-    scores, values = map(jnp.asarray, particles())
-    repulsion = stein_direction(scores, values, SVGDConfig(kernel=kernel)).repulsion
-    np.testing.assert_allclose(jnp.sum(repulsion, axis=0), 0.0, atol=1e-12)
-    assert jnp.sum(repulsion * (values - values.mean(axis=0, keepdims=True))) > 0.1
+    scores, values = particles()
+    repulsion = np.asarray(stein_direction(scores, values, SVGDConfig(kernel=kernel)).repulsion)
+    np.testing.assert_allclose(np.sum(repulsion, axis=0), 0.0, atol=1e-12)
+    assert np.sum(repulsion * (values - values.mean(axis=0, keepdims=True))) > 0.1
 
 
 def test_bandwidth_lets_no_gradient_through(x64):
     # T3: with h differentiated, sum K does not change with scale and the radial part is 0 (-7e-15 against +26)
-    flat = jnp.asarray(particles()[1]).reshape(6, -1)
+    flat = particles()[1].reshape(6, -1)
     centred = flat - flat.mean(axis=0, keepdims=True)
 
     def kernel_sum(values, config):
@@ -106,22 +106,23 @@ def test_bandwidth_lets_no_gradient_through(x64):
         distances = squared_distances(values)
         return -jnp.sum(jnp.exp(-distances / jnp.median(distances[jnp.triu_indices(6, 1)])))
 
-    radial = jnp.sum(jax.grad(kernel_sum)(flat, SVGDConfig()) * centred)
-    repulsion = stein_direction(flat[:, :, None], flat[:, :, None], SVGDConfig()).repulsion[..., 0]
+    radial = np.sum(jax.jit(jax.grad(kernel_sum), static_argnums=1)(flat, SVGDConfig()) * centred)
+    repulsion = np.asarray(stein_direction(flat[:, :, None], flat[:, :, None], SVGDConfig()).repulsion)[..., 0]
     # -sum_ij K_ij holds each pair twice, and a particle in both roles: twice m times the repulsion.
-    assert radial == pytest.approx(float(2 * 6 * jnp.sum(repulsion * centred)), rel=1e-12)
-    assert abs(jnp.sum(jax.grad(leaking)(flat) * centred)) < 1e-12 < radial
+    assert radial == pytest.approx(2 * 6 * np.sum(repulsion * centred), rel=1e-12)
+    assert abs(np.sum(jax.jit(jax.grad(leaking))(flat) * centred)) < 1e-12 < radial
+    gradients = jax.jit(jax.grad(bandwidth), static_argnums=1)
     for rule in ("median_log", "mean"):
-        gradient = jax.grad(lambda d, rule=rule: bandwidth(d, SVGDConfig(bandwidth=rule)))(squared_distances(flat))
+        gradient = gradients(np.mean((flat[:, None] - flat[None]) ** 2, axis=-1), SVGDConfig(bandwidth=rule))
         np.testing.assert_array_equal(gradient, 0.0)
 
 
 def test_bandwidth_rules_on_three_particles(x64):
     # hand: 0, 1 and 3 on a line have squared distances 1, 4, 9: median 4, mean 14/3 (with the diagonal: 1)
-    distances = squared_distances(jnp.array([[0.0], [1.0], [3.0]]))
+    distances, of = squared_distances(np.array([[0.0], [1.0], [3.0]])), jax.jit(bandwidth, static_argnums=1)
     for rule, want in {"median": 4.0, "median_log": 4 / math.log(3), "mean": 14 / 3, "fixed": 1.0}.items():
         for scale in (1.0, 0.5):
-            got = bandwidth(distances, SVGDConfig(bandwidth=rule, bandwidth_scale=scale))
+            got = of(distances, SVGDConfig(bandwidth=rule, bandwidth_scale=scale))
             assert got == pytest.approx(scale * want, rel=1e-12)
 
 
@@ -166,7 +167,7 @@ def settle(particles: np.ndarray, mean: float, std: float, config: SVGDConfig, s
         direction = svgd.stein_direction((mean - x)[:, None] / std**2, x[:, None], config)
         return x + step * std**2 * (direction.drive + direction.repulsion)[:, 0], None
 
-    return jax.jit(lambda x: jax.lax.scan(move, x, length=steps)[0])(jnp.asarray(particles))
+    return jax.device_get(jax.jit(lambda x: jax.lax.scan(move, x, length=steps)[0])(particles))
 
 
 @pytest.mark.parametrize("std", [0.1, 3.0])
@@ -183,7 +184,7 @@ def test_two_particles_settle_at_the_closed_form_variance(x64, rule, scale, want
     config = SVGDConfig(num_particles=2, bandwidth=rule, bandwidth_scale=scale)
     start = np.random.default_rng(0).normal(size=(2, 3)) * std
     end = settle(start, 1.5, std, config, step=0.3, steps=500)
-    assert jnp.sum(jnp.var(end, axis=0)) / std**2 == pytest.approx(want, abs=1e-6)
+    assert np.sum(np.var(end, axis=0)) / std**2 == pytest.approx(want, abs=1e-6)
     np.testing.assert_allclose(end.mean(axis=0), 1.5, atol=1e-6)
 
 
@@ -200,9 +201,9 @@ def test_eight_particles_settle_in_a_simplex(x64, settings, want):
     # T6: trace of the covariance for m = 8 in D = 16 >= m - 1: 7 x / (e^x - 1), x = 1, log 8, 1/4; IMQ: asvgd.md 3.2
     start = np.random.default_rng(1).normal(size=(8, 16))
     end = settle(start, 0.0, 1.0, SVGDConfig(num_particles=8, **settings), step=0.5, steps=4000)
-    assert jnp.sum(jnp.var(end, axis=0)) == pytest.approx(want, abs=1e-4)
-    pairs = squared_distances(end)[jnp.triu_indices(8, 1)]
-    np.testing.assert_allclose(pairs, jnp.mean(pairs), rtol=1e-3)
+    assert np.sum(np.var(end, axis=0)) == pytest.approx(want, abs=1e-4)
+    pairs = np.mean((end[:, None] - end[None]) ** 2, axis=-1)[np.triu_indices(8, 1)]
+    np.testing.assert_allclose(pairs, np.mean(pairs), rtol=1e-3)
 
 
 @pytest.mark.parametrize("rule", ["median", "mean"])
@@ -259,10 +260,8 @@ def tiny_move(eta: np.ndarray, zs: np.ndarray, x: np.ndarray, phi: np.ndarray) -
 def one_step(config, x, y, num_data, optimizer=None, **kwargs):
     """Flat eta after one update, the start, and the noise it used."""
     posterior = make_amortized_svgd(TINY, tiny_apply, 1, optimizer or optax.sgd(1.0), config, **kwargs)
-    state = posterior.init(jax.random.key(0))
-    new, metrics = posterior.update(
-        jax.random.key(1), state, jnp.asarray(x)[:, None], jnp.asarray(y)[:, None], num_data
-    )
+    state = jax.jit(posterior.init)(jax.random.key(0))
+    new, metrics = jax.jit(posterior.update)(jax.random.key(1), state, x[:, None], y[:, None], num_data)
     flat = [np.concatenate([np.ravel(s.eta["w"]), s.eta["b"]]) for s in (state, new)]
     return flat[0], flat[1], np.asarray(new.z), metrics
 
@@ -347,9 +346,9 @@ def test_independent_points_take_the_repulsion_and_the_batch_the_score(x64):
     x, y, r = rng.normal(size=n), rng.normal(size=n), rng.normal(size=n)
     config = SVGDConfig(num_particles=m, repulsion_points="independent", likelihood_std=1.0)
     posterior = make_amortized_svgd(TINY, tiny_apply, 1, optax.sgd(1.0), config)
-    state = posterior.init(jax.random.key(0))
-    columns = [jnp.asarray(a)[:, None] for a in (x, y, r)]
-    new, _ = posterior.update(jax.random.key(1), state, *columns[:2], n, columns[2])
+    state = jax.jit(posterior.init)(jax.random.key(0))
+    columns = [a[:, None] for a in (x, y, r)]
+    new, _ = jax.jit(posterior.update)(jax.random.key(1), state, *columns[:2], n, columns[2])
     eta, end = (np.concatenate([np.ravel(s.eta["w"]), s.eta["b"]]) for s in (state, new))
     zs = np.asarray(new.z)
     drive, repulsion = double_loop(y - tiny_values(eta, zs, x), tiny_values(eta, zs, r), "rbf", 1.0)
@@ -380,13 +379,13 @@ def test_further_points_join_the_batch(x64, points):
 
 def test_noise_is_redrawn_or_kept():
     # `fixed` keeps the z of init for good; `every_step` never uses the same z twice
-    x, key = jnp.linspace(-1.0, 1.0, 6)[:, None], jax.random.key(0)
+    x, key = np.linspace(-1.0, 1.0, 6, dtype=np.float32)[:, None], jax.random.key(0)
     for redraw in ("fixed", "every_step"):
         posterior = make_amortized_svgd(TINY, tiny_apply, 1, optax.sgd(0.1), SVGDConfig(num_particles=4, redraw=redraw))
-        first = posterior.init(key)
-        second, _ = posterior.update(jax.random.key(1), first, x, x, 6)
-        third, _ = posterior.update(jax.random.key(2), second, x, x, 6)
-        same = [bool(jnp.any(a.z == b.z)) for a, b in ((first, second), (second, third))]
+        first, update = jax.jit(posterior.init)(key), jax.jit(posterior.update)
+        second, _ = update(jax.random.key(1), first, x, x, 6)
+        third, _ = update(jax.random.key(2), second, x, x, 6)
+        same = [bool(np.any(np.asarray(a.z) == np.asarray(b.z))) for a, b in ((first, second), (second, third))]
         assert same == [redraw == "fixed"] * 2
 
 

@@ -15,18 +15,18 @@ from tests.jaxplore import classic, probes
 def constant_networks(ddpg, q, target_q, action=0.0):
     """Networks that say the same everywhere: zero kernels, and these numbers as the last biases."""
     shapes = jax.eval_shape(ddpg.init, jax.random.key(0))
-    state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    state.params["critic"]["output"]["bias"] = jnp.array([q])
-    state.target["critic"]["output"]["bias"] = jnp.array([target_q])
-    state.params["actor"]["output"]["bias"] = jnp.array([action])
+    state = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
+    state.params["critic"]["output"]["bias"][:] = q
+    state.target["critic"]["output"]["bias"][:] = target_q
+    state.params["actor"]["output"]["bias"][:] = action
     return state
 
 
 def batch_of(obs, reward=0.0, terminated=False, truncated=False):
     """As many transitions as there are rows in `obs`, with actions of 0."""
-    rows = jnp.ones(len(obs))
+    rows = np.ones(len(obs), np.float32)
     flags = rows * terminated > 0, rows * truncated > 0
-    return Transition(obs, jnp.zeros((len(obs), 1)), reward * rows, -obs, *flags)
+    return Transition(obs, np.zeros((len(obs), 1), np.float32), rows * np.float32(reward), -obs, *flags)
 
 
 def test_targets_of_one_transition():
@@ -35,7 +35,7 @@ def test_targets_of_one_transition():
     ddpg = make_ddpg(2, 1, DDPGConfig(hidden=(3,), discount=0.9, reward_scale=2.0))
     update, state = jax.jit(ddpg.update), constant_networks(ddpg, q=2.0, target_q=4.0)
     for terminated, truncated in itertools.product((False, True), repeat=2):
-        metrics = update(jax.random.key(1), state, batch_of(jnp.ones((1, 2)), 0.7, terminated, truncated))[1]
+        metrics = update(jax.random.key(1), state, batch_of(np.ones((1, 2), np.float32), 0.7, terminated, truncated))[1]
         assert float(metrics["q_loss"]) == pytest.approx((2 - (1.4 if terminated else 5.0)) ** 2, rel=1e-5)
         assert float(metrics["policy_loss"]) == -2.0
 
@@ -44,7 +44,7 @@ def test_an_update_moves_each_network_at_its_own_rate_and_the_slow_ones_after():
     # Adam's first step is lr times the gradient's sign; Q's target is above it
     ddpg = make_ddpg(2, 1, DDPGConfig(hidden=(3,), critic_lr=0.1, tau=0.25))
     state = constant_networks(ddpg, q=2.0, target_q=4.0)
-    after, _ = jax.jit(ddpg.update)(jax.random.key(1), state, batch_of(jnp.ones((1, 2))))
+    after, _ = jax.jit(ddpg.update)(jax.random.key(1), state, batch_of(np.ones((1, 2), np.float32)))
     np.testing.assert_allclose(after.params["critic"]["output"]["bias"], 2.1, rtol=1e-5)
     np.testing.assert_allclose(after.target["critic"]["output"]["bias"], 0.75 * 4 + 0.25 * 2.1, rtol=1e-5)
 
@@ -53,8 +53,8 @@ def test_only_hidden_kernels_of_the_value_are_penalised():
     # with the value where it should be, the penalty alone pulls: towards 0, in the hidden kernel and nowhere else
     ddpg = make_ddpg(2, 1, DDPGConfig(hidden=(3,), critic_l2=1.0, critic_lr=0.1, activation="relu", layer_norm=False))
     state = constant_networks(ddpg, q=1.0, target_q=0.0)
-    state.params["critic"]["hidden_0"]["kernel"] = jnp.full((3, 3), -5.0)
-    batch = batch_of(jnp.ones((1, 2)), reward=1.0, terminated=True)
+    state.params["critic"]["hidden_0"]["kernel"][:] = -5.0
+    batch = batch_of(np.ones((1, 2), np.float32), reward=1.0, terminated=True)
     after, _ = jax.jit(ddpg.update)(jax.random.key(1), state, batch)
     np.testing.assert_allclose(after.params["critic"]["hidden_0"]["kernel"], -4.9, rtol=1e-5)
     np.testing.assert_array_equal(after.params["critic"]["output"]["bias"], [1.0])
@@ -175,7 +175,7 @@ def test_the_policy_that_acts_is_redrawn_and_the_one_that_measures_is_another(up
     assert changed == [False, False, False, True, False, False, False, True, False]
     assert len(set(metrics["distance"].tolist())) == 9
     act, actor, obs = jax.jit(ddpg.act), ddpg.actor(first), np.ones((5, 3), np.float32)
-    greedy, drawn = ddpg.act_greedily(actor, obs), act(jax.random.key(0), actor, obs)
+    greedy, drawn = jax.jit(ddpg.act_greedily)(actor, obs), act(jax.random.key(0), actor, obs)
     assert np.sqrt(np.mean((np.asarray(greedy) - np.asarray(drawn)) ** 2)) > 0.01
     np.testing.assert_array_equal(drawn, act(jax.random.key(1), actor, obs))
 
@@ -221,8 +221,9 @@ def test_values_of_the_probes(trained, probe, want):
 def test_policy_finds_the_best_action(trained):
     # reward -(action - obs / 2)^2
     ddpg, state = trained[0], trained[1]["target_action"]
+    act = jax.jit(ddpg.act_greedily)
     for obs in (-1.0, 1.0):
-        assert float(ddpg.act_greedily(ddpg.actor(state), jnp.array([obs]))[0]) == pytest.approx(obs / 2, abs=0.07)
+        assert float(act(ddpg.actor(state), np.array([obs], np.float32))[0]) == pytest.approx(obs / 2, abs=0.07)
         assert value(state, obs, -obs) == pytest.approx(-2.25, abs=0.15)
 
 

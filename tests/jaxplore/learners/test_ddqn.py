@@ -15,16 +15,16 @@ from tests.jaxplore import probes
 def constant_networks(ddqn, q, target):
     """Networks that say the same everywhere: zero kernels, and these numbers as the last biases."""
     shapes = jax.eval_shape(ddqn.init, jax.random.key(0))
-    state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    state.params["output"]["bias"] = jnp.array(q)
-    state.target["output"]["bias"] = jnp.array(target)
+    state = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
+    state.params["output"]["bias"][:] = q
+    state.target["output"]["bias"][:] = target
     return state
 
 
 def one_step(action, reward, terminated=False, truncated=False):
     """A batch of one transition between two observations of 2 entries."""
-    flags = jnp.array([terminated]), jnp.array([truncated])
-    return Transition(jnp.ones((1, 2)), jnp.array([action]), jnp.array([reward]), -jnp.ones((1, 2)), *flags)
+    flags, obs = (np.array([terminated]), np.array([truncated])), np.ones((1, 2), np.float32)
+    return Transition(obs, np.array([action], np.float32), np.array([reward], np.float32), -obs, *flags)
 
 
 def test_targets_of_one_transition():
@@ -44,11 +44,12 @@ def test_an_update_moves_the_value_of_the_action_taken():
     # Adam's first step is lr times the gradient's sign: up to the target for the action taken, nothing for the others
     ddqn = make_ddqn(2, 3, DDQNConfig(hidden=(3,), lr=0.01))
     state = constant_networks(ddqn, q=[1.0, 3.0, 2.0], target=[0.0, 0.0, 0.0])
-    after, _ = jax.jit(ddqn.update)(jax.random.key(1), state, one_step([0.0, 0.0, 1.0], 5.0, terminated=True))
+    update = jax.jit(ddqn.update)
+    after, _ = update(jax.random.key(1), state, one_step([0.0, 0.0, 1.0], 5.0, terminated=True))
     np.testing.assert_allclose(after.params["output"]["bias"], [1.0, 3.0, 2.01], atol=1e-6)
     jax.tree.map(np.testing.assert_array_equal, after.target, state.target)
     # the largest entry counts, whatever the others are
-    relaxed, _ = jax.jit(ddqn.update)(jax.random.key(1), state, one_step([-0.2, 0.1, 0.3], 5.0, terminated=True))
+    relaxed, _ = update(jax.random.key(1), state, one_step([-0.2, 0.1, 0.3], 5.0, terminated=True))
     jax.tree.map(np.testing.assert_array_equal, relaxed, after)
 
 
@@ -89,8 +90,9 @@ def test_actions_are_epsilon_greedy():
     # epsilon 0.4 and 4 choices: the best one has 0.6 + 0.4 / 4 = 0.7, the others 0.1 each (20,000 draws: +-0.0065)
     ddqn = make_ddqn(2, 4, DDQNConfig(hidden=(3,), epsilon_start=0.4, epsilon_end=0.4))
     actor = ddqn.actor(constant_networks(ddqn, [0.0, -1.0, 2.0, 1.0], [9.0, 0.0, 0.0, 0.0]))
-    np.testing.assert_array_equal(ddqn.act_greedily(actor, jnp.ones((3, 2))), [[0, 0, 1, 0]] * 3)
-    actions = jax.device_get(ddqn.act(jax.random.key(0), actor, jnp.ones((100, 200, 2))))
+    greedy = jax.jit(ddqn.act_greedily)(actor, np.ones((3, 2), np.float32))
+    np.testing.assert_array_equal(greedy, [[0, 0, 1, 0]] * 3)
+    actions = jax.device_get(jax.jit(ddqn.act)(jax.random.key(0), actor, np.ones((100, 200, 2), np.float32)))
     assert actions.shape == (100, 200, 4)
     assert np.all(actions.sum(axis=-1) == 1)
     assert set(np.unique(actions)) == {0.0, 1.0}
@@ -149,7 +151,8 @@ def test_values_of_the_probes(trained, probe, want):
 
 def test_the_best_choice_depends_on_what_is_seen(trained):
     ddqn, states = trained
-    greedy = ddqn.act_greedily(ddqn.actor(states["choice"]), jnp.array([[-1.0], [1.0]]))
+    act = jax.jit(lambda state, obs: ddqn.act_greedily(ddqn.actor(state), obs))
+    greedy = act(states["choice"], np.array([[-1.0], [1.0]], np.float32))
     np.testing.assert_array_equal(greedy, [[1, 0], [0, 1]])
 
 

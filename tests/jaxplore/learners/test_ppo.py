@@ -18,7 +18,7 @@ from jaxplore.learners.ppo import (
     minibatches,
 )
 from jaxplore.types import Transition
-from tests.jaxplore import classic, probes
+from tests.jaxplore import classic, probes, programs
 
 
 def test_advantages_by_hand():
@@ -72,23 +72,26 @@ def test_probability_of_a_clipped_draw():
     mean, log_std = jnp.array([0.3]), jnp.array([-0.5])
     std = math.exp(-0.5)
     grid = np.linspace(-0.9999, 0.9999, 4001)
-    density = jax.vmap(lambda a: jnp.exp(clipped_log_prob(mean, log_std, a[None])))(jnp.asarray(grid, jnp.float32))
+    densities = jax.jit(jax.vmap(lambda a: jnp.exp(clipped_log_prob(mean, log_std, a[None]))))
+    density = densities(grid.astype(np.float32))
     np.testing.assert_allclose(density, stats.norm.pdf(grid, 0.3, std), rtol=1e-4)
-    ends = [float(jnp.exp(clipped_log_prob(mean, log_std, jnp.array([end])))) for end in (-1.0, 1.0)]
+    ends = np.asarray(densities(np.array([-1, 1], np.float32))).tolist()
     np.testing.assert_allclose(ends, [stats.norm.cdf(-1, 0.3, std), stats.norm.sf(1, 0.3, std)], rtol=1e-4)
     assert np.trapezoid(density, grid) + sum(ends) == pytest.approx(1, abs=1e-3)
-    far = jax.value_and_grad(lambda m: clipped_log_prob(m, jnp.array([-3.0]), jnp.array([1.0])))(jnp.array([-2.0]))
+    beyond = jax.jit(jax.value_and_grad(lambda m: clipped_log_prob(m, jnp.array([-3.0]), jnp.array([1.0]))))
+    far = beyond(np.array([-2.0], np.float32))
     assert np.all(np.isfinite(far[0])) and float(far[1][0]) > 0
 
 
 def test_each_epoch_goes_through_all_steps_once():
     # 6 rows of 8 hold something: each is taken once in each epoch, in a new order; 2 rows are each taken three times
-    order = np.asarray(minibatches(jax.random.key(0), 8, jnp.int32(6), 3, 2, 5))
+    draw = jax.jit(minibatches, static_argnums=(1, 3, 4, 5))
+    order = np.asarray(draw(jax.random.key(0), 8, np.int32(6), 3, 2, 5))
     assert order.shape == (15, 2)
     epochs = order.reshape(5, 6)
     np.testing.assert_array_equal(np.sort(epochs, axis=1), np.tile(np.arange(6), (5, 1)))
     assert len({tuple(epoch) for epoch in epochs}) > 1
-    few = np.asarray(minibatches(jax.random.key(0), 8, jnp.int32(2), 3, 2, 5)).reshape(5, 6)
+    few = np.asarray(draw(jax.random.key(0), 8, np.int32(2), 3, 2, 5)).reshape(5, 6)
     np.testing.assert_array_equal(np.sort(few, axis=1), np.tile([0, 0, 0, 1, 1, 1], (5, 1)))
 
 
@@ -99,18 +102,18 @@ SMALL = {"hidden": (4,), "rollout_steps": LENGTH, "minibatch_size": LENGTH, "epo
 def constant_values(ppo, extrinsic, intrinsic):
     """Everything 0 but the last biases of the values: these numbers everywhere."""
     shapes = jax.eval_shape(ppo.init, jax.random.key(0))
-    state = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
-    state.params["value"]["output"]["bias"] = jnp.array([extrinsic, intrinsic])
+    state = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), shapes)
+    state.params["value"]["output"]["bias"][:] = extrinsic, intrinsic
     return state
 
 
 def rollout_of(terminated, truncated=(False,) * LENGTH, extra=0):
     """Steps with extrinsic reward 1 and intrinsic reward 2, and `extra` rows of padding."""
     total = LENGTH + extra
-    obs = jnp.arange(1.0, total + 1)[:, None]
-    flags = (jnp.array([*flag, *(False,) * extra]) for flag in (terminated, truncated))
-    steps = Transition(obs, jnp.full((total, 1), 0.5), jnp.full(total, 1.0), obs + 0.5, *flags)
-    return Rollout(steps, jnp.full(total, 2.0), jnp.full(total, -0.5 * 0.25 - 0.5 * math.log(2 * math.pi)))
+    obs, ones = np.arange(1, total + 1, dtype=np.float32)[:, None], np.ones(total, np.float32)
+    flags = (np.array([*flag, *(False,) * extra]) for flag in (terminated, truncated))
+    steps = Transition(obs, 0.5 * ones[:, None], ones, obs + 0.5, *flags)
+    return Rollout(steps, 2 * ones, ones * np.float32(-0.5 * 0.25 - 0.5 * math.log(2 * math.pi)))
 
 
 @pytest.mark.parametrize(("extrinsic", "intrinsic"), [(1.0, 0.0), (0.0, 1.0)])
@@ -141,7 +144,9 @@ def test_ends_of_episodes_are_ends_for_the_extrinsic_stream_alone(extrinsic, int
 
     for terminated, truncated in (((), ()), ((2,), ()), ((), (2,)), ((5,), ()), ((), (5,))):
         flags = [[t in stops for t in range(LENGTH)] for stops in (terminated, truncated)]
-        loss = -float(update(jax.random.key(0), state, rollout_of(*flags), jnp.ones(1), jnp.int32(6))[1]["policy_loss"])
+        loss = -float(
+            update(jax.random.key(0), state, rollout_of(*flags), np.ones(1, np.float32), np.int32(6))[1]["policy_loss"]
+        )
         if extrinsic:
             # an end is worth nothing; a time limit what its successor is worth, 3
             assert loss == pytest.approx(returns(1.0, 3.0, [*terminated, *truncated], 0 if terminated else 3) - 3)
@@ -160,12 +165,12 @@ def test_the_intrinsic_stream_goes_on_to_what_is_seen_next():
         )  # fmt: skip
         ppo = make_ppo(1, 1, config)
         state = constant_values(ppo, 0.0, 0.0)
-        state.params["value"]["hidden_0"]["kernel"] = jnp.full((1, 4), 1e-3)
-        state.params["value"]["output"]["kernel"] = jnp.full((4, 2), 250.0)
+        state.params["value"]["hidden_0"]["kernel"][:] = 1e-3
+        state.params["value"]["output"]["kernel"][:] = 250.0
         rollout = rollout_of([False] * LENGTH)
-        steps = rollout.transitions._replace(reward=jnp.zeros(LENGTH))
-        rollout = rollout._replace(transitions=steps, intrinsic_reward=jnp.zeros(LENGTH))
-        metrics = jax.jit(ppo.update)(jax.random.key(0), state, rollout, jnp.zeros(1), jnp.int32(6))[1]
+        steps = rollout.transitions._replace(reward=np.zeros(LENGTH, np.float32))
+        rollout = rollout._replace(transitions=steps, intrinsic_reward=np.zeros(LENGTH, np.float32))
+        metrics = jax.jit(ppo.update)(jax.random.key(0), state, rollout, np.zeros(1, np.float32), np.int32(6))[1]
         assert -float(metrics["policy_loss"]) == pytest.approx(np.mean(want), abs=1e-3)
 
 
@@ -173,13 +178,14 @@ def test_padding_changes_nothing_and_without_steps_nothing_is_learned():
     # the same six steps, with two rows of rubbish after them or without, in one gradient step
     ppo, rng = make_ppo(1, 1, PPOConfig(**SMALL)), np.random.default_rng(0)
     state, update = constant_values(ppo, 0.0, 0.0), jax.jit(ppo.update)
-    draw = lambda leaf: jnp.asarray(0.3 * rng.normal(size=leaf.shape), jnp.float32)  # noqa: E731
+    draw = lambda leaf: np.asarray(0.3 * rng.normal(size=leaf.shape), np.float32)  # noqa: E731
     state = state.replace(params=jax.tree.map(draw, state.params))
     ends = [False, False, True, False, False, False]
-    plain = update(jax.random.key(0), state, rollout_of(ends), jnp.ones(1), jnp.int32(6))
-    padded = update(jax.random.key(0), state, rollout_of(ends, extra=2), jnp.ones(1), jnp.int32(6))
+    one = np.ones(1, np.float32)
+    plain = update(jax.random.key(0), state, rollout_of(ends), one, np.int32(6))
+    padded = update(jax.random.key(0), state, rollout_of(ends, extra=2), one, np.int32(6))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-6), plain, padded)
-    after, _ = update(jax.random.key(0), state, rollout_of(ends, extra=2), jnp.ones(1), jnp.int32(0))
+    after, _ = update(jax.random.key(0), state, rollout_of(ends, extra=2), one, np.int32(0))
     jax.tree.map(np.testing.assert_array_equal, after, state)
 
 
@@ -192,28 +198,33 @@ def trained():
     )  # fmt: skip
     ppo = make_ppo(1, 1, config)
 
-    def learn(probe):
+    names = ("two_steps", "endless", "target_action")
+
+    @programs.compiled
+    @jax.vmap
+    def learn(which):
         def go(state, key):
             rows_key, act_key, update_key = jax.random.split(key, 3)
-            steps = probe(rows_key, 64)
+            each = [probes.PROBES[name](rows_key, 64) for name in names]
+            steps = jax.tree.map(lambda *leaves: jnp.stack(leaves)[which], *each)
             action = ppo.act(act_key, ppo.actor(state), steps.obs)
-            if probe is probes.target_action:
-                steps = steps._replace(reward=-((action - steps.obs / 2)[:, 0] ** 2))
+            # This probe's reward is of the action that was taken.
+            reward = jnp.where(which == 2, -((action - steps.obs / 2)[:, 0] ** 2), steps.reward)
             log_prob = ppo.log_prob(ppo.actor(state), steps.obs, action)
-            rollout = Rollout(steps._replace(action=action), steps.reward, log_prob)
+            rollout = Rollout(steps._replace(action=action, reward=reward), reward, log_prob)
             return ppo.update(update_key, state, rollout, steps.obs[0], jnp.int32(64))[0], None
 
         keys = jax.random.split(jax.random.key(1), 150)
         return jax.lax.scan(go, ppo.init(jax.random.key(0)), keys)[0]
 
-    names = ("two_steps", "endless", "target_action")
-    return ppo, jax.jit(lambda: {name: learn(probes.PROBES[name]) for name in names})()
+    states = jax.device_get(learn(np.arange(3)))
+    return ppo, {name: jax.tree.map(lambda leaf, i=i: leaf[i], states) for i, name in enumerate(names)}
 
 
 def values(state, obs):
     """Both heads at one observation: a tanh network written out."""
     hidden = state.params["value"]["hidden_0"]
-    x = jnp.tanh(jnp.array([obs]) @ hidden["kernel"] + hidden["bias"])
+    x = np.tanh(np.array([obs]) @ hidden["kernel"] + hidden["bias"])
     return x @ state.params["value"]["output"]["kernel"] + state.params["value"]["output"]["bias"]
 
 
@@ -235,8 +246,9 @@ def test_intrinsic_values_of_a_probe(trained):
 def test_policy_finds_the_best_action(trained):
     # reward -(action - obs / 2)^2
     ppo, states = trained
+    act = jax.jit(ppo.act_greedily)
     for obs in (-1.0, 1.0):
-        greedy = ppo.act_greedily(ppo.actor(states["target_action"]), jnp.array([obs]))
+        greedy = act(ppo.actor(states["target_action"]), np.array([obs], np.float32))
         assert float(greedy[0]) == pytest.approx(obs / 2, abs=0.1)
 
 

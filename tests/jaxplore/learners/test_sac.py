@@ -23,29 +23,29 @@ def x64():
 
 def zeros(sac):
     """The state of a learner with every number 0: its shapes, without the price of compiling `init`."""
-    return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(sac.init, jax.random.key(0)))
+    return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), jax.eval_shape(sac.init, jax.random.key(0)))
 
 
-def mlp(params, x):
-    """A leaky-ReLU network with two hidden layers, written out."""
+def mlp(params, x, xp=jnp):
+    """A leaky-ReLU network with two hidden layers, written out; with `xp=np` in NumPy."""
     for name in ("hidden_0", "hidden_1"):
         x = x @ params[name]["kernel"] + params[name]["bias"][None]
-        x = jnp.where(x > 0, x, 0.01 * x)
+        x = xp.where(x > 0, x, 0.01 * x)
     return x @ params["output"]["kernel"] + params["output"]["bias"][None]
 
 
-def q_value(params, obs, action, member):
+def q_value(params, obs, action, member, xp=jnp):
     one = jax.tree.map(lambda leaf: leaf[member], params["q"])
-    return mlp(one, jnp.concatenate([obs, action], axis=1))[:, 0]
+    return mlp(one, xp.concatenate([obs, action], axis=1), xp)[:, 0]
 
 
 def constant_networks(sac, q, v, target_v, mean=0.0, head=0.0):
     """Networks that say the same everywhere: zero kernels, and these numbers as the last biases."""
     state = zeros(sac)
-    state.params["q"]["output"]["bias"] = jnp.array(q)[:, None]
-    state.params["v"]["output"]["bias"] = jnp.array([v])
-    state.params["policy"]["mlp"]["output"]["bias"] = jnp.array([mean, head])
-    state.target_v["output"]["bias"] = jnp.array([target_v])
+    state.params["q"]["output"]["bias"][:] = np.array(q)[:, None]
+    state.params["v"]["output"]["bias"][:] = v
+    state.params["policy"]["mlp"]["output"]["bias"][:] = mean, head
+    state.target_v["output"]["bias"][:] = target_v
     return state
 
 
@@ -55,14 +55,14 @@ def test_targets_of_one_transition():
     sac = make_sac(2, 1, SACConfig(hidden=(3, 3), alpha=0.5, discount=0.9, reward_scale=5.0))
     update = jax.jit(sac.update)
     state = constant_networks(sac, q=[2.0, 3.0], v=1.5, target_v=4.0, mean=0.2, head=1.0)
-    obs = jnp.ones((1, 2))
+    obs = np.ones((1, 2), np.float32)
     log_std = -20 + 11 * (math.tanh(1.0) + 1)
-    params = GaussianParams(jnp.array([[0.2]]), jnp.array([[log_std]]))
-    log_prob = float(sample_tanh_gaussian(jax.random.key(1), params)[1][0])
+    params = GaussianParams(np.array([[0.2]], np.float32), np.array([[log_std]], np.float32))
+    log_prob = float(jax.jit(sample_tanh_gaussian)(jax.random.key(1), params)[1][0])
     penalty = 1e-3 * (math.tanh(0.2) ** 2 + log_std**2)
     for terminated, truncated in itertools.product((False, True), repeat=2):
-        flags = jnp.array([terminated]), jnp.array([truncated])
-        batch = Transition(obs, jnp.zeros((1, 1)), jnp.array([0.7]), 2 * obs, *flags)
+        flags = np.array([terminated]), np.array([truncated])
+        batch = Transition(obs, 0 * obs[:, :1], np.array([0.7], np.float32), 2 * obs, *flags)
         metrics = update(jax.random.key(1), state, batch)[1]
         q_target = 5 * 0.7 + (0 if terminated else 0.9 * 4.0)
         want = {
@@ -92,7 +92,7 @@ def test_update_is_three_adams_in_the_order_of_nnaisense_max(x64):
     sac = make_sac(3, 2, config)
     rng = np.random.default_rng(0)
     state = jax.tree.map(lambda x: x.astype(float) if x.dtype == jnp.float32 else x, zeros(sac))
-    draw = lambda leaf: jnp.asarray(0.5 * rng.normal(size=leaf.shape))  # noqa: E731
+    draw = lambda leaf: 0.5 * rng.normal(size=leaf.shape)  # noqa: E731
     state = state.replace(params=jax.tree.map(draw, state.params), target_v=jax.tree.map(draw, state.target_v))
 
     def heads(policy, obs):
@@ -135,12 +135,12 @@ def test_update_is_three_adams_in_the_order_of_nnaisense_max(x64):
         return (jnp.arctanh(action) - mean) / jnp.exp(log_std)
 
     params, target = state.params, state.target_v
-    moments = {name: (jax.tree.map(jnp.zeros_like, params[name]),) * 2 for name in params}
+    moments = {name: (jax.tree.map(np.zeros_like, params[name]),) * 2 for name in params}
     update, reference, noise = jax.jit(sac.update), jax.jit(reference), jax.jit(noise)
     clipped = total = 0
     for i in range(3):
-        obs, next_obs, reward = (jnp.asarray(rng.normal(size=shape)) for shape in ((8, 3), (8, 3), 8))
-        action, ends = jnp.asarray(rng.uniform(-1, 1, size=(8, 2))), jnp.asarray(rng.uniform(size=8) < 0.3)
+        obs, next_obs, reward = (rng.normal(size=shape) for shape in ((8, 3), (8, 3), 8))
+        action, ends = rng.uniform(-1, 1, size=(8, 2)), rng.uniform(size=8) < 0.3
         batch, key = Transition(obs, action, reward, next_obs, ends, ~ends), jax.random.key(10 + i)
         eps = noise(key, params["policy"], obs)
         params, target, moments, gradients = reference(params, target, moments, i + 1.0, batch, eps)
@@ -166,38 +166,46 @@ def test_actions_are_the_policys():
     # greedy: tanh(mean); drawn: median tanh(mean), and P(a < tanh(mean + std)) = 0.841 (4,000 draws: +-0.018)
     sac = make_sac(2, 1, SACConfig(hidden=(3, 3), log_std_min=-2.0, log_std_max=0.0))
     actor = sac.actor(constant_networks(sac, [0.0, 0.0], 0.0, 0.0, mean=0.4))
-    assert float(sac.act_greedily(actor, jnp.ones(2))[0]) == pytest.approx(math.tanh(0.4), rel=1e-6)
-    actions = np.asarray(sac.act(jax.random.key(1), actor, jnp.ones((4000, 2))))
+    greedy = jax.jit(sac.act_greedily)(actor, np.ones(2, np.float32))
+    assert float(greedy[0]) == pytest.approx(math.tanh(0.4), rel=1e-6)
+    actions = np.asarray(jax.jit(sac.act)(jax.random.key(1), actor, np.ones((4000, 2), np.float32)))
     assert actions.shape == (4000, 1)
     assert np.mean(actions < math.tanh(0.4)) == pytest.approx(0.5, abs=0.03)
     assert np.mean(actions < math.tanh(0.4 + math.exp(-1))) == pytest.approx(stats.norm.cdf(1), abs=0.02)
 
 
-def train(names, steps, **settings):
-    """SAC on batches of 64 from each probe, side by side in one program; `(sac, states, metrics)` by probe."""
+def train(names, steps, starts=None, **settings):
+    """SAC on batches from each probe, side by side in one program: `(sac, states, metrics)`, lists.
+
+    With a learned entropy weight, `starts` are the weights at the start.
+    """
     shared = {"hidden": (32, 32), "lr": 3e-3, "tau": 0.05, "policy_penalty": 0.0, "log_std_min": -5.0, "init": "lecun"}
     sac = make_sac(1, 1, SACConfig(**shared, **settings))
 
-    def learn(rows):
+    def learn(rows, start=None):
+        first = sac.init(jax.random.key(0))
+        if start is not None:
+            first = first.replace(params={**first.params, "log_alpha": jnp.log(start)})
         step = lambda state, scanned: sac.update(scanned[0], state, scanned[1])  # noqa: E731
-        return jax.lax.scan(step, sac.init(jax.random.key(0)), (jax.random.split(jax.random.key(1), steps), rows))
+        return jax.lax.scan(step, first, (jax.random.split(jax.random.key(1), steps), rows))
 
-    learned = probes.train_on_each([probes.PROBES[name] for name in names], learn, steps)
-    states, metrics = zip(*learned, strict=True)
-    return sac, dict(zip(names, states, strict=True)), dict(zip(names, metrics, strict=True))
+    more = () if starts is None else (jnp.array(starts),)
+    learned = probes.train_on_each([probes.PROBES[name] for name in names], learn, steps, *more)
+    return sac, *(list(part) for part in zip(*learned, strict=True))
 
 
 @pytest.fixture(scope="module")
 def trained():
     """On every probe with a discount of 0.5; alpha is so small that the entropy is worth at most 0.01."""
-    return train(list(probes.PROBES), steps=2000, alpha=1e-3, discount=0.5)
+    sac, states, _ = train(list(probes.PROBES), steps=2000, alpha=1e-3, discount=0.5)
+    return sac, dict(zip(probes.PROBES, states, strict=True))
 
 
 def values(state, obs, action=0.0):
     """`(Q of each member, V)` at one observation."""
     obs, action = np.array([[obs]]), np.array([[action]])
-    both = [float(q_value(state.params, obs, action, k)[0]) for k in (0, 1)]
-    return [*both, float(mlp(state.params["v"], obs)[0, 0])]
+    both = [float(q_value(state.params, obs, action, k, np)[0]) for k in (0, 1)]
+    return [*both, float(mlp(state.params["v"], obs, np)[0, 0])]
 
 
 @pytest.mark.parametrize(
@@ -218,8 +226,9 @@ def test_values_of_the_probes(trained, probe, want):
 def test_policy_finds_the_best_action(trained):
     # reward -(action - obs / 2)^2: the best action is obs / 2, worth 0; at -obs it is -(3/2)^2
     sac, state = trained[0], trained[1]["target_action"]
+    act = jax.jit(sac.act_greedily)
     for obs in (-1.0, 1.0):
-        assert float(sac.act_greedily(sac.actor(state), jnp.array([obs]))[0]) == pytest.approx(obs / 2, abs=0.05)
+        assert float(act(sac.actor(state), np.array([obs], np.float32))[0]) == pytest.approx(obs / 2, abs=0.05)
         np.testing.assert_allclose(values(state, obs, obs / 2), 0.0, atol=0.05)
         np.testing.assert_allclose(values(state, obs, -obs)[:2], -2.25, atol=0.15)
 
@@ -235,22 +244,22 @@ def test_entropy_is_worth_alpha_per_nat():
         return -(log_std + 0.5 * math.log(2 * math.pi * math.e) + squash)
 
     best = optimize.minimize_scalar(negative_entropy, bounds=(-2, 1), method="bounded")
-    _, states, metrics = train(["constant"], steps=2000, alpha=2.0)
-    q_0, q_1, v = values(states["constant"], 0.0)
+    _, (state,), (metrics,) = train(["constant"], steps=2000, alpha=2.0)
+    q_0, q_1, v = values(state, 0.0)
     np.testing.assert_allclose([q_0, q_1], 1.0, atol=0.05)
     assert v == pytest.approx(1 - 2 * best.fun, abs=0.06)
-    assert float(jnp.mean(metrics["constant"]["entropy"][-500:])) == pytest.approx(-best.fun, abs=0.02)
+    assert np.mean(metrics["entropy"][-500:]) == pytest.approx(-best.fun, abs=0.02)
 
 
-@pytest.mark.parametrize("start", [0.5, 1e-3])
-def test_a_learned_entropy_weight_settles_where_the_entropy_is_the_target(start):
+def test_a_learned_entropy_weight_settles_where_the_entropy_is_the_target():
     # reward -(a - obs / 2)^2: the policy of weight alpha is close to a Gaussian of variance alpha / 2, with entropy
     # log(pi e alpha) / 2 nats; it is -1 at alpha = exp(-3) / pi = 0.016, from above and from below
-    _, _, metrics = train(["target_action"], steps=2500, alpha=start, learn_alpha=True)
-    entropy, alpha = (np.asarray(metrics["target_action"][name]) for name in ("entropy", "alpha"))
-    assert alpha[0] == pytest.approx(start, rel=0.01)
-    assert np.mean(entropy[-500:]) == pytest.approx(-1.0, abs=0.1)
-    assert np.mean(alpha[-500:]) == pytest.approx(math.exp(-3) / math.pi, rel=0.3)
+    starts = (0.5, 1e-3)
+    _, _, metrics = train(["target_action"] * 2, steps=2500, starts=starts, learn_alpha=True)
+    for start, seen in zip(starts, metrics, strict=True):
+        assert seen["alpha"][0] == pytest.approx(start, rel=0.01)
+        assert np.mean(seen["entropy"][-500:]) == pytest.approx(-1.0, abs=0.1)
+        assert np.mean(seen["alpha"][-500:]) == pytest.approx(math.exp(-3) / math.pi, rel=0.3)
 
 
 def test_bad_settings_are_refused():
