@@ -81,7 +81,7 @@ def fit(config, x, y, steps, seeds=4, lr=1e-2, batch_size=None, num_data=None, *
         )
         return covariance, mean, state, stds
 
-    run = programs.compiled(jax.vmap(one_seed))
+    run = jax.jit(jax.vmap(one_seed))
     return jax.device_get(run(jax.random.split(jax.random.key(0), seeds)))
 
 
@@ -190,8 +190,9 @@ def test_prior_and_extra_points_give_the_posterior_where_data_are_missing(x64, s
 
 def test_mlp_generator_finds_a_gaussian_process_posterior():
     # T10: 40 random Fourier features, exact sd by linear algebra; mean |log ratio| < 0.12 with l = 0 and uniform points
-    # (measured 0.08 here, 0.05 in asvgd.md), > 0.5 with the paper's l = 1 on the data
-    rng, size, std, steps = np.random.default_rng(0), 40, 0.1, 8000
+    # (measured 0.07 here, 0.05 in asvgd.md), > 0.5 with the paper's l = 1 on the data (measured 0.54 after 8,000 steps;
+    # after 4,000 l = 0 is at 0.12)
+    rng, size, std = np.random.default_rng(0), 40, 0.1
     frequency, phase = rng.normal(size=(1, size)) / 0.5, rng.uniform(0, 2 * np.pi, size=(1, size))
 
     def features(x, xp=np):
@@ -205,7 +206,7 @@ def test_mlp_generator_finds_a_gaussian_process_posterior():
         {"kernel": np.ones((size, 1), np.float32)}, GeneratorConfig(noise_size=size, init_std="lecun")
     )
 
-    def error(**settings):
+    def error(steps, **settings):
         config = SVGDConfig(likelihood_std=std, prior="weights", prior_scale=math.sqrt(size / 2), **settings)
         optimizer = optax.adam(optax.cosine_decay_schedule(5e-3, steps))
         apply = lambda params, inputs: features(inputs, jnp) @ params["kernel"]  # noqa: E731
@@ -222,5 +223,5 @@ def test_mlp_generator_finds_a_gaussian_process_posterior():
         thetas = run(init_key, jax.random.split(steps_key, steps), sample_key)
         return np.mean(np.abs(np.log(np.std(np.asarray(thetas) @ features(grid).T, axis=0) / exact)))
 
-    assert error(self_weight=0.0, repulsion_points="uniform", repulsion_scale=2.0) < 0.12
-    assert error() > 0.5
+    assert error(8000, self_weight=0.0, repulsion_points="uniform", repulsion_scale=2.0) < 0.12
+    assert error(4000) > 0.5
