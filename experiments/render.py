@@ -75,7 +75,8 @@ def load_actor(run: Path) -> tuple[RunConfig, Environment, Act, int]:
     """
     import jax
 
-    from experiments.runs.directory import RunDirectory, Status
+    from experiments.runs.directory import RunDirectory
+    from experiments.runs.status import Status
     from experiments.training import build, loop
 
     directory = RunDirectory(run)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -13,23 +12,26 @@ import jax
 
 import envs
 from envs.base import ENGINES, Environment
-from experiments import runtime
+from experiments import process, runtime
 from experiments.analysis import report
-from experiments.runs import flags
-from experiments.runs.config import RunConfig, differences, flag, path_of, replace
-from experiments.runs.directory import RunDirectory, Status
+from experiments.runs import flags, modules, place
+from experiments.runs.config import RunConfig, flag, path_of, replace
+from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
 from experiments.runs.presets import preset_config
 from experiments.runs.spec import RunRef, RunSpec, from_json
+from experiments.runs.status import Status
 from experiments.runs.upgrades import MOVED
-from experiments.training import build, loop, parent
+from experiments.training import build, loop, memory, parent
+from experiments.training.programs import Programs, make_programs
 from jaxplore.exploration import Explorer
 from jaxplore.methods import METHODS
 from jaxplore.networks import ACTIVATIONS, INITIALIZERS
 from jaxplore.validate import FieldError
 
 PROGRAM = "python -m experiments.run"
-RUNS = Path("runs")
+DESCRIPTION = "Explore an environment by a belief's own uncertainty, and draw what was seen."
+NOTES = f"--import=MODULE: {modules.HELP}."
 
 
 @dataclass(frozen=True)
@@ -39,12 +41,14 @@ class CommandLine:
     out: str | None = None
     """Directory of the run. By default a new one: runs/ENV-METHOD-PRESET-seedN."""
     resume: bool = False
-    """Continue the run in --out from its latest checkpoint."""
+    """Continue the run in --out from its latest checkpoint; with a larger --steps, make it that much longer."""
     config: str | None = None
     """A config.json to start from, as every run saves it; other flags come on top."""
     parent: str | None = None
     """Start from the policy of another run: DIRECTORY or DIRECTORY@STEP (by default its latest checkpoint). Its
     observation statistics come with it; critics are new and there are no data. For methods on the task's reward."""
+    debug: bool = False
+    """Show the traceback below the message of an error."""
     version: bool = False
     """Print the versions of everything that results depend on, and stop."""
 
@@ -61,9 +65,12 @@ def parse(argv: Sequence[str]) -> tuple[CommandLine, RunSpec]:
 
     Raises:
         ValueError: bad input, with the field, the value and what is allowed.
-        RunError: `--config` or the run to resume cannot be read.
+        RunError: `--config` or the run to resume cannot be read, or a module cannot be imported.
         SystemExit: `--help`, or a flag that does not exist.
     """
+    named, argv = modules.take(argv)
+    named += modules.of_env(flags.option(argv, "env"))
+    modules.load(named)
     start = _start(argv)
     method = METHODS[start.config.method]
     layout = flags.Layout(
@@ -78,22 +85,28 @@ def parse(argv: Sequence[str]) -> tuple[CommandLine, RunSpec]:
         first=method.reads(start.config.explorer),
         moved={flag(f"explorer.{old}"): new for old, new in MOVED.items()},
     )
+    if "-h" in argv or "--help" in argv:
+        print(flags.brief((start.config, CommandLine()), PROGRAM, DESCRIPTION, layout, NOTES))
+        raise SystemExit(0)
     description = (
-        "Explore an environment by a belief's own uncertainty, and draw what was seen.\n\n"
-        "The defaults below are those of the preset; --preset=paper --help shows the paper's.\n\n"
-        f"Settings that {start.config.method} reads come first; one that the chosen method does not read is refused."
+        f"{DESCRIPTION}\n\n"
+        "The defaults below are those of the preset; --preset=paper --help=all shows the paper's.\n\n"
+        f"Settings that {start.config.method} reads come first; one that the chosen method does not read is "
+        f"refused.\n\n{NOTES}"
     )
+    words = ["--help" if word == "--help=all" else word for word in argv]
     command, changes = flags.parse(
-        argv, (CommandLine(), start.config), prog=PROGRAM, description=description, layout=layout
+        words, (CommandLine(), start.config), prog=PROGRAM, description=description, layout=layout
     )
-    words = {name: command[name] or None for name in ("out", "config", "parent")}
+    paths = {name: command[name] or None for name in ("out", "config", "parent")}
     try:
-        ref = RunRef.parse(words["parent"]) if words["parent"] else start.parent
+        ref = RunRef.parse(paths["parent"]) if paths["parent"] else start.parent
         config: RunConfig = replace(start.config, changes)
         check_read(argv, config)
     except FieldError as error:
         raise ValueError(error.spell(flag(error.field))) from error
-    return CommandLine(**{**command, **words}), RunSpec(config, ref)
+    imports = tuple(dict.fromkeys((*start.imports, *named)))
+    return CommandLine(**{**command, **paths}), RunSpec(config, ref, imports)
 
 
 def _start(argv: Sequence[str]) -> RunSpec:
@@ -150,79 +163,40 @@ def check_read(argv: Sequence[str], config: RunConfig) -> None:
         )
 
 
-def choose_directory(command: CommandLine, spec: RunSpec) -> RunDirectory:
-    """The run's directory, checked against what lies there; nothing is written.
-
-    Raises:
-        RunError: it holds another run and `--resume` is not given, or it cannot be resumed.
-        ValueError: `--resume` without `--out`, or with a configuration that differs from the saved one.
-    """
-    config = spec.config
-    if command.out is None:
-        if command.resume:
-            raise ValueError("--resume needs --out: the directory of the run to continue.")
-        env = re.sub(r"[^\w.-]", "-", config.env)
-        base = RUNS / f"{env}-{config.method}-{config.preset}-seed{config.seed}"
-        names = [base, *(base.with_name(f"{base.name}-{n}") for n in range(2, 10_000))]
-        return RunDirectory(next(path for path in names if not path.exists()))
-    out = RunDirectory(command.out)
-    there, status = out.entries(), out.status()
-    if not command.resume:
-        if there:
-            what = "another run" if status is not Status.ABSENT else "other files"
-            raise RunError(f"--out={out} holds {what}. Give another directory, or --resume to continue the run.")
-        return out
-    if there is None:
-        raise RunError(f"--out={out} is not there, so it cannot be resumed. Leave --resume out to start a run.")
-    if status is Status.ABSENT:
-        if not out.holds_only_scraps():
-            raise RunError(f"--out={out} holds no run (no config.json). Give the directory of a run.")
-        return out
-    if status is Status.DIVERGED:
-        raise RunError(
-            f"--out={out} diverged: every seed came out with numbers that are not finite, and --resume would repeat "
-            "that to the bit. Start a run with other settings in another --out."
-        )
-    changed = differences(out.config(), config)
-    was = out.spec().parent
-    if was != spec.parent:
-        changed.append(f"parent: {was} -> {spec.parent}")
-    if changed:
-        raise ValueError(
-            f"--resume: the configuration disagrees with the one saved in {out} in {'; '.join(changed)}. "
-            "Resume with the saved values, or start a run in another --out."
-        )
-    if out.is_kept() and status is not Status.FINISHED:
-        raise RunError(f"--out={out} is what was kept of a run, without checkpoints: it can be compared, not resumed.")
-    return out
-
-
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; the exit status is 0, 1 (the run failed), 2 (bad input) or 130 (interrupted)."""
+    """Run the command line; the exit status is 0, 1 (the run failed), 2 (bad input), 130 (interrupted) or 143
+    (terminated).
+    """
     argv = list(sys.argv[1:] if argv is None else argv)
+    debug, directory = "--debug" in argv, None
     try:
-        command, spec = parse(argv)
-        if command.version:
-            print("\n".join(f"{name} {version}" for name, version in runtime.versions().items()))
-            return 0
-        env, agent, spec = prepare(spec, resume=command.resume)
-        directory = choose_directory(command, spec)
-    except (ValueError, RunError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    try:
-        return carry_out(spec, directory, env, agent, resume=command.resume)
+        try:
+            command, spec = parse(argv)
+            if command.version:
+                print("\n".join(f"{name} {version}" for name, version in runtime.versions().items()))
+                return 0
+            env, agent, programs, spec = prepare(spec, resume=command.resume)
+            chosen = place.choose(command.out, spec, resume=command.resume)
+        except (ValueError, RunError) as error:
+            print(f"error: {error}", file=sys.stderr)
+            process.show_cause(error, debug=debug)
+            return 2
+        with place.owned(command.out, spec, chosen, resume=command.resume) as directory:
+            return carry_out(spec, directory, env, agent, programs, resume=command.resume)
     except RunError as error:
         print(f"\nerror: {error}", file=sys.stderr)
+        process.show_cause(error, debug=debug)
         return 1
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         again = f"{PROGRAM} --out={shlex.quote(str(directory))} --resume"
-        print(f"\nStopped. To continue from the latest checkpoint: {again}", file=sys.stderr)
-        return 130
+        how = f" To continue from the latest checkpoint: {again}" if directory is not None else ""
+        print(f"\nStopped.{how}", file=sys.stderr)
+        return process.status_of(stop)
 
 
-def prepare(spec: RunSpec, *, resume: bool) -> tuple[Environment, Explorer, RunSpec]:
-    """Environment and agent, which refuse what they cannot do when they are built: before anything is written.
+def prepare(spec: RunSpec, *, resume: bool) -> tuple[Environment, Explorer, Programs, RunSpec]:
+    """Environment, agent and programs, which refuse what they cannot do when they are built: before anything is
+    written.
 
     A run that is resumed has its parent's policy in its checkpoints.
 
@@ -238,18 +212,25 @@ def prepare(spec: RunSpec, *, resume: bool) -> tuple[Environment, Explorer, RunS
         agent = build.make_agent(spec.config, env)
         if spec.parent is not None and not resume:
             spec = dataclasses.replace(spec, parent=parent.resolve(spec.parent, env, agent))
-        return env, agent, spec
+        memory.check_steps(spec.config)
+        programs = make_programs(spec.config, env, agent)
+        memory.check_arrays(spec.config, env, programs)
+        return env, agent, programs, spec
     except FieldError as error:
         path = "parent" if error.field == "parent" else path_of(spec.config, error)
         raise ValueError(error.spell(flag(path)) if path else str(error)) from error
 
 
-def carry_out(spec: RunSpec, directory: RunDirectory, env: Environment, agent: Explorer, *, resume: bool) -> int:
+def carry_out(
+    spec: RunSpec, directory: RunDirectory, env: Environment, agent: Explorer, programs: Programs, *, resume: bool
+) -> int:
     """Run, draw, and close with the summary table."""
     config = spec.config
     runtime.use_compilation_cache()
     if resume and (changed := directory.changed_versions()):
         print(f"Versions have changed, so not to the bit: {'; '.join(changed)}", file=sys.stderr)
+    if directory.status() is not Status.ABSENT and place.lengthens(directory, spec):
+        directory.extend(spec)
     status = directory.status()
     if not directory.is_kept():
         directory.begin(spec, build.make_scene(config, env, agent))
@@ -264,10 +245,10 @@ def carry_out(spec: RunSpec, directory: RunDirectory, env: Environment, agent: E
             f"writing to {directory}",
             flush=True,
         )
-        loop.run(spec, directory, env, agent, resume=resume)
+        loop.run(spec, directory, env, agent, programs, resume=resume)
     print("\n" + report.write(directory))
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    process.carry_out(main)

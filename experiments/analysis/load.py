@@ -8,9 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments.runs.config import RunConfig
-from experiments.runs.directory import RunDirectory, Status
+from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
 from experiments.runs.scene import Scene
+from experiments.runs.schedule import gap
+from experiments.runs.status import Status
 
 
 class LoadedRun(NamedTuple):
@@ -33,10 +35,17 @@ def load(path: Path, until: int | None = None) -> LoadedRun:
     config, rows = directory.config(), directory.rows()
     wanted = until or config.steps
     last = max((row["step"] for row in rows), default=0)
-    if directory.status() is Status.DIVERGED and last < wanted:
+    status = directory.status()
+    if status is Status.DIVERGED and last < wanted:
         raise RunError(f"{path} diverged at step {last}, before step {wanted}. Compare with --until={last} or less.")
-    if last < wanted:
+    if last < wanted and status is not Status.FINISHED:
         raise RunError(f"{path} stands at step {last} of {wanted}. Finish it with --resume first.")
+    damage = gap(config, rows, wanted)
+    if damage is not None:
+        raise RunError(
+            f"{directory.metrics_path} {damage[1]}. What to do: put back a copy of the file, or compare with "
+            f"--until={damage[0]} or less."
+        )
     scene = scene_of(directory)
     if until is None:
         return LoadedRun(directory, config, rows, scene)

@@ -20,7 +20,7 @@ import logging
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from experiments.runs.codec import Misfit, decode, encode
+from experiments.runs.codec import NONE, Allowances, Misfit, decode, encode
 from experiments.runs.errors import RunError, disk_error
 from experiments.runs.files import sync
 
@@ -120,7 +120,7 @@ class Checkpoints:
             self._warn(f"cannot remove old checkpoints in {self.directory}: {error.strerror}")
 
     def restore_latest(
-        self, abstract_state: Any, until: int | None = None, newer: Mapping[str, Any] | None = None
+        self, abstract_state: Any, until: int | None = None, allowed: Allowances = NONE
     ) -> Restored | None:
         """Reads the newest checkpoint that is whole. Deletes nothing, so another process may look at a running run.
 
@@ -129,7 +129,7 @@ class Checkpoints:
                 `jax.eval_shape` makes of it. JAX arrays come back as JAX arrays (spread over devices like those given
                 here), NumPy arrays as NumPy arrays whatever `jax_enable_x64` says, typed keys as typed keys.
             until: a step; checkpoints of later ones are passed over.
-            newer: leaves that a state saved by an older version lacks, and the number that they are then full of.
+            allowed: in what the saved state may differ from `abstract_state`.
 
         Returns:
             The step, the state and the meta; None if there is no checkpoint.
@@ -149,7 +149,7 @@ class Checkpoints:
             for reason in reasons:
                 self._warn(f"{reason}; continuing from the one of step {step}")
             try:
-                state = decode(abstract_state, manifest["leaves"], arrays, newer or {})
+                state = decode(abstract_state, manifest["leaves"], arrays, allowed)
             except Misfit as misfit:
                 raise RunError(
                     f"the checkpoint {path} does not fit this run: {misfit}. What to do: resume with the code and "

@@ -1,7 +1,7 @@
 """A state as arrays by name and records of what they were, and back."""
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Collection, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,20 @@ import numpy as np
 
 class Misfit(Exception):
     """A saved state is whole but is not of the structure asked for."""
+
+
+class Allowances(NamedTuple):
+    """In what a saved state may differ from the one that is asked for."""
+
+    newer: Mapping[str, Any] = {}
+    """Leaves that a state saved by an older version lacks, and the number that they are then full of."""
+    longer: Collection[str] = ()
+    """NumPy leaves that may be shorter along their second axis, and are then filled up with zeros: a run that goes
+    on for more steps than it was begun for."""
+
+
+NONE = Allowances()
+"""A saved state is to be just as the one that is asked for."""
 
 
 def _named_leaves(tree: Any) -> tuple[dict[str, Any], Any]:
@@ -55,7 +69,7 @@ def encode(state: Any) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]
 
 
 def decode(
-    abstract_state: Any, records: dict[str, dict[str, Any]], arrays: dict[str, np.ndarray], newer: Mapping[str, Any]
+    abstract_state: Any, records: dict[str, dict[str, Any]], arrays: dict[str, np.ndarray], allowed: Allowances
 ) -> Any:
     """Puts a state together again, the inverse of `encode`.
 
@@ -63,21 +77,23 @@ def decode(
         abstract_state: a state with the structure, shapes and dtypes of the saved one.
         records: what the leaves were.
         arrays: the leaves that are arrays.
-        newer: leaves that a state saved by an older version lacks, and the number that they are then full of.
+        allowed: where the saved state may differ.
 
     Raises:
         Misfit: structure, shapes or dtypes are not those of `abstract_state`.
     """
     like, structure = _named_leaves(abstract_state)
-    absent = {name for name in newer if name in like and name not in records}
+    absent = {name for name in allowed.newer if name in like and name not in records}
     if like.keys() - absent != records.keys():
         missing, unknown = sorted(like.keys() - absent - records.keys()), sorted(records.keys() - like.keys())
         raise Misfit(
             "; ".join(f"it {verb} {_some(names)}" for verb, names in (("lacks", missing), ("has", unknown)) if names)
         )
-    leaves = {name: np.full(like[name].shape, newer[name], like[name].dtype) for name in absent}
+    leaves = {name: np.full(like[name].shape, allowed.newer[name], like[name].dtype) for name in absent}
     for name, record in records.items():
         leaf = record["value"] if record["kind"] == "python" else _rebuild(name, record, arrays[name], like[name])
+        if name in allowed.longer:
+            leaf = _lengthen(leaf, np.shape(like[name]))
         if np.shape(leaf) != np.shape(like[name]) or _dtype(leaf) != _dtype(like[name]):
             raise Misfit(
                 f"{name} is {_dtype(leaf)}{list(np.shape(leaf))} there and "
@@ -85,6 +101,13 @@ def decode(
             )
         leaves[name] = leaf
     return jax.tree_util.tree_unflatten(structure, [leaves[name] for name in like])
+
+
+def _lengthen(leaf: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """`leaf` with zeros after it along its second axis, if that makes it of this shape."""
+    if leaf.ndim != len(shape) or leaf.ndim < 2 or leaf.shape[1] >= shape[1]:
+        return leaf
+    return np.pad(leaf, [(0, shape[1] - leaf.shape[1] if axis == 1 else 0) for axis in range(leaf.ndim)])
 
 
 def _rebuild(name: str, record: dict[str, Any], array: np.ndarray, like: Any) -> Any:

@@ -14,13 +14,17 @@ from jaxplore.validate import Checks, FieldError
 Preset = Literal["laptop", "paper", "smoke"]
 PRESETS: tuple[str, ...] = get_args(Preset)
 
+MOST_SEEDS = 2**32
+"""How many seeds there are."""
+
 
 @dataclass(frozen=True)
 class RunConfig:
     """One run: an environment, a method, seeds, and every setting."""
 
     env: str = "ant_maze"
-    """Environment to explore: one of ours, or `gymnasium:ID`, `brax:NAME`, `playground:NAME`."""
+    """Environment to explore: one of ours, or `gymnasium:ID`, `gymnasium:MODULE:ID` (which imports the module first),
+    `brax:NAME`, `playground:NAME`."""
     method: str = "implicit"
     """How to explore: a row of the methods table (`jaxplore/methods.py`), such as `implicit` (the paper's), `max`,
     `disagreement`, `icm` or `random` (uniform actions)."""
@@ -28,9 +32,10 @@ class RunConfig:
     """Where the other settings start from: `laptop` (10,000 steps in minutes on 2 CPU cores), `paper` (the paper's
     numbers), `smoke` (under a minute)."""
     seed: int = 0
-    """First seed."""
+    """First seed. A seed that is carried beside others ends as it would alone, but for rounding (on the device products
+    of several seeds round otherwise), and in `nchain`, whose flip states are those of the first seed."""
     num_seeds: int = 1
-    """Seeds carried side by side: seed, seed + 1, ..."""
+    """Seeds carried side by side, counting up from the first."""
     steps: int = 10_000
     """Environment steps of each seed, the random ones at the start included."""
     backend: str = "auto"
@@ -59,6 +64,10 @@ class RunConfig:
         checks.at_least("seed", 0)
         for name in ("num_seeds", "steps", "checkpoint_every"):
             checks.at_least(name, 1)
+        if self.seed + self.num_seeds > MOST_SEEDS:
+            # JAX's keys would take such a seed modulo 2**32, and be another seed's.
+            allowed = f"at most {MOST_SEEDS - 1} (with num_seeds={self.num_seeds}: {MOST_SEEDS - self.num_seeds})"
+            raise checks.refusal("seed", "is out of range", allowed)
         checks.at_least("eval_every", 0)
         checks.at_least("eval_episodes", 1)
         checks.in_range("obs_noise", 0.0)

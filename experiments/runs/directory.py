@@ -14,7 +14,6 @@
 | `*.png` | pictures |
 """
 
-import enum
 import gzip
 import json
 import os
@@ -26,15 +25,17 @@ from typing import Any
 import numpy as np
 
 from experiments import runtime
+from experiments.runs import lock
 from experiments.runs import scene as scenes
 from experiments.runs import spec as specs
 from experiments.runs.checkpoint import Checkpoints
 from experiments.runs.config import RunConfig
 from experiments.runs.errors import RunError, disk_error
-from experiments.runs.files import replacing, write_text
+from experiments.runs.files import read_json, read_text, replacing, write_text
 from experiments.runs.metrics import MetricsLog, read_metrics
 from experiments.runs.scene import Scene
 from experiments.runs.spec import RunSpec
+from experiments.runs.status import Status
 from experiments.runs.tensorboard import TensorBoardLog
 
 CONFIG, VERSIONS, SCENE, OUTCOME = "config.json", "versions.json", "scene.json", "outcome.json"
@@ -43,19 +44,6 @@ CHECKPOINTS, TENSORBOARD = "checkpoints", "tensorboard"
 CALIBRATION, OLD_CALIBRATION = "calibration.json", "posterior.json"
 KEPT = (CONFIG, VERSIONS, SCENE, OUTCOME, CALIBRATION, OLD_CALIBRATION)
 """Files that `RunDirectory.keep` copies as they are, those that there are."""
-
-
-class Status(enum.Enum):
-    """How far a run has come."""
-
-    ABSENT = "absent"
-    """There is no run here."""
-    PARTIAL = "partial"
-    """It can be resumed."""
-    FINISHED = "finished"
-    """All its steps are taken."""
-    DIVERGED = "diverged"
-    """Every seed ended in numbers that are not finite. Resumed, it would end there again."""
 
 
 class RunDirectory:
@@ -82,7 +70,7 @@ class RunDirectory:
         if not (self.path / CONFIG).is_file():
             return Status.ABSENT
         try:
-            found = Status(json.loads((self.path / OUTCOME).read_text())["status"])
+            found = Status(read_json(self.path / OUTCOME)["status"])
         except FileNotFoundError:
             # Before there were outcomes and scenes the walk was a run's last file; a kept run has neither.
             is_old = self._has_walk() and not (self.path / SCENE).exists()
@@ -102,13 +90,13 @@ class RunDirectory:
         return (self.path / PACKED_METRICS).exists() and not (self.path / METRICS).exists()
 
     def entries(self) -> set[str] | None:
-        """Names of what lies here, but for drafts of files that were never finished; None: there is no directory.
+        """Names of what lies here, but for the lock; None: there is no directory.
 
         Raises:
             RunError: it cannot be read.
         """
         try:
-            return {entry.name for entry in self.path.iterdir()} if self.path.is_dir() else None
+            return {entry.name for entry in self.path.iterdir()} - {lock.NAME} if self.path.is_dir() else None
         except OSError as error:
             raise disk_error("look for a run", self.path, error) from error
 
@@ -127,10 +115,11 @@ class RunDirectory:
         """
         path = self.path / CONFIG
         try:
-            return specs.from_json(path.read_text(), str(path), as_written=True)
-        except (OSError, UnicodeDecodeError) as error:
+            text = read_text(path)
+        except (OSError, ValueError) as error:
             reason = getattr(error, "strerror", None) or error
             raise RunError(f"{self.path} holds no run: cannot read {path} ({reason}).") from error
+        return specs.from_json(text, str(path), as_written=True)
 
     def config(self) -> RunConfig:
         """The configuration. Raises as `spec`."""
@@ -143,7 +132,7 @@ class RunDirectory:
             RunError: the file is damaged.
         """
         try:
-            return scenes.from_json((self.path / SCENE).read_text())
+            return scenes.from_json(read_json(self.path / SCENE))
         except FileNotFoundError:
             return None
         except (OSError, ValueError) as error:
@@ -152,7 +141,7 @@ class RunDirectory:
     def changed_versions(self) -> list[str]:
         """What has another version now than when the run began, as `name: then -> now`."""
         try:
-            then: dict[str, Any] = json.loads((self.path / VERSIONS).read_text())
+            then = read_json(self.path / VERSIONS)
         except (OSError, ValueError):
             return []
         now = runtime.versions()
@@ -185,11 +174,11 @@ class RunDirectory:
         for name in (CALIBRATION, OLD_CALIBRATION):
             if (self.path / name).exists():
                 try:
-                    found = json.loads((self.path / name).read_text())
+                    found = read_json(self.path / name)
                     if not isinstance(found.get("step"), int) or not isinstance(found.get("seeds"), list):
                         raise ValueError("it lacks step or seeds")
                     return found
-                except (OSError, ValueError, AttributeError) as error:
+                except (OSError, ValueError) as error:
                     again = f"python -m experiments.calibrate {self.path}"
                     raise self._unreadable(name, error, again) from error
         return None
@@ -199,6 +188,14 @@ class RunDirectory:
         return Checkpoints(self.path / CHECKPOINTS)
 
     # Writing.
+
+    def extend(self, spec: RunSpec) -> None:
+        """Make the run longer: it is then partial. Raises `RunError` if it cannot be written."""
+        try:
+            (self.path / OUTCOME).unlink(missing_ok=True)
+            write_text(self.path / CONFIG, specs.to_json(spec))
+        except OSError as error:
+            raise disk_error("make the run longer", self.path, error) from error
 
     def begin(self, spec: RunSpec, scene: Scene) -> None:
         """Save what the run is; what is there already stays as it is.

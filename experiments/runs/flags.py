@@ -21,6 +21,9 @@ try:
 except ImportError as error:
     raise RunError('the command line needs tyro. What to do: pip install -e ".[experiments]".') from error
 
+WIDTH = 100
+"""Columns of the brief help."""
+
 
 class Layout(NamedTuple):
     """How the fields of configurations become flags."""
@@ -100,6 +103,35 @@ def parse(
         hint = f" Did you mean {nearest[0]}?" if nearest else ""
         raise ValueError(f"{word} is not known.{hint} Allowed: what {prog} --help lists.")
     return [dataclasses.asdict(getattr(parsed, name)) for name in names]
+
+
+def brief(groups: Sequence[Any], prog: str, description: str, layout: Layout, notes: str = "") -> str:
+    """The help in one screen: the flags that are no part's own, and where the others are."""
+    lines, parts = [f"usage: {prog} [--FLAG=VALUE ...]", "", description, ""], []
+    for group in groups:
+        documents = document(type(group))
+        for item in dataclasses.fields(group):
+            value = getattr(group, item.name)
+            if dataclasses.is_dataclass(value):
+                inner = dataclasses.fields(value) if item.name in layout.unprefixed else ()
+                parts += [field.name for field in inner if field.name in layout.first] or [item.name]
+                parts = [
+                    f"{part}.*" if dataclasses.is_dataclass(getattr(value, part, None)) else part for part in parts
+                ]
+                continue
+            shown = "" if value is None or value is False or value == () else f"={value}"
+            head = f"  --{item.name.replace('_', '-')}{shown}".ljust(24)
+            # The first sentence: `. ` and not `.`, which is in names of files.
+            text = documents.get(item.name, "").partition(". ")[0].rstrip(".")
+            own = textwrap.wrap(text, WIDTH - 26) or [""]
+            lines += [f"{head}  {own[0]}", *(f"{'':26}{line}" for line in own[1:])]
+    for name in ("env", "method"):
+        names = ", ".join(layout.choices.get(name, ()))
+        lines += ["", *textwrap.wrap(f"{name}: {names}", WIDTH, subsequent_indent="  ")]
+    settings = ", ".join(f"--{name.replace('_', '-')}" for name in parts)
+    text = f"Settings of the method, which --help=all describes one by one: {settings}"
+    lines += ["", *textwrap.wrap(text, WIDTH, subsequent_indent="  ", break_on_hyphens=False)]
+    return "\n".join([*lines, "", *textwrap.wrap(notes, WIDTH, subsequent_indent="  ")] if notes else lines)
 
 
 def _flags(config: Any, unprefixed: Sequence[str], prefix: str = "--") -> Iterator[str]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from experiments.runs.errors import RunError, disk_error
-from experiments.runs.files import replacing
+from experiments.runs.files import parse_json, replacing
 
 Row = Mapping[str, Any]
 
@@ -40,10 +40,10 @@ def read_metrics(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
 
 def _parse(line: bytes, path: str | os.PathLike[str], number: int) -> dict[str, Any]:
     try:
-        row = json.loads(line)
+        row = parse_json(line.decode())
     except ValueError:
         row = None
-    if not isinstance(row, dict) or "step" not in row:
+    if not isinstance(row, dict) or type(row.get("step")) is not int or type(row.get("seed", 0)) is not int:
         raise RunError(
             f"line {number} of {Path(path)} is damaged. What to do: put back a copy of the file, or start a new run "
             "with another --out."

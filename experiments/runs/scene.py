@@ -67,14 +67,13 @@ def to_json(scene: Scene) -> str:
     return json.dumps(data, indent=2) + "\n"
 
 
-def from_json(text: str) -> Scene:
-    """A scene from JSON.
+def from_json(data: dict[str, Any]) -> Scene:
+    """A scene from what `to_json` writes.
 
     Raises:
         ValueError: it is none.
     """
     try:
-        data: dict[str, Any] = json.loads(text)
         plan = data["floor_plan"]
         boxes = plan and {name: tuple(map(tuple, plan[name])) for name in ("walls", "cells")}
         floor_plan = plan and FloorPlan(tuple(plan["position"]), **boxes)

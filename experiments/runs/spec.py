@@ -7,9 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from experiments.runs import upgrades
+from experiments.runs import modules, upgrades
 from experiments.runs.config import RunConfig, replace, to_dict
 from experiments.runs.errors import RunError
+from experiments.runs.files import parse_json
 from experiments.runs.presets import preset_config
 from jaxplore.methods import METHODS
 from jaxplore.validate import FieldError
@@ -58,6 +59,8 @@ class RunSpec:
     config: RunConfig
     parent: RunRef | None = None
     """The run whose policy this one starts from."""
+    imports: tuple[str, ...] = ()
+    """Modules of a person's own that its method or environment comes from."""
 
     @property
     def identity(self) -> str:
@@ -78,7 +81,7 @@ class RunSpec:
 def to_json(spec: RunSpec) -> str:
     """A specification as indented JSON: the fields of the configuration, the format, the parent and the identity."""
     parent = dataclasses.asdict(spec.parent) if spec.parent else None
-    extra = {"format": FORMAT, "identity": spec.identity, "parent": parent}
+    extra = {"format": FORMAT, "identity": spec.identity, "parent": parent, "imports": list(spec.imports)}
     return json.dumps({**extra, **to_dict(spec.config)}, indent=2) + "\n"
 
 
@@ -94,11 +97,11 @@ def from_json(text: str, source: str, method: str | None = None, *, as_written: 
     Raises:
         ValueError: not JSON, an unknown field (naming the nearest match), a value that a field refuses, or with
             `as_written` one that has been changed.
-        RunError: a newer format.
+        RunError: a newer format, or a module that it needs and that has not been imported.
     """
     try:
-        data = json.loads(text)
-    except json.JSONDecodeError as error:
+        data = parse_json(text)
+    except ValueError as error:
         raise ValueError(f"{source} is not JSON: {error}.") from error
     if not isinstance(data, dict):
         raise ValueError(f"{source} holds {type(data).__name__}. Allowed: an object with the fields of a run.")
@@ -109,10 +112,12 @@ def from_json(text: str, source: str, method: str | None = None, *, as_written: 
             "of jaxplore that wrote it, which versions.json beside it names."
         )
     identity, parent = data.pop("identity", None), data.pop("parent", None)
+    imports = _imports(data.pop("imports", []), source)
+    modules.check([*imports, *modules.of_env(str(data.get("env", "")))], source)
     try:
         names = (data.get("preset", "laptop"), data.get("env", "ant_maze"), data.get("method", method or "implicit"))
         start = preset_config(*names)
-        spec = RunSpec(replace(start, upgrades.upgrade(data, start, found)), _parent(parent))
+        spec = RunSpec(replace(start, upgrades.upgrade(data, start, found)), _parent(parent), imports)
     except FieldError as error:
         raise ValueError(f"{source}: {error.spell(error.field)}") from error
     # A file that lacks a field is of an older version, which did not hash it.
@@ -122,6 +127,12 @@ def from_json(text: str, source: str, method: str | None = None, *, as_written: 
             f"says {identity}. Allowed: the file as it was. To run other settings, give a copy to --config."
         )
     return spec
+
+
+def _imports(data: Any, source: str) -> tuple[str, ...]:
+    if not isinstance(data, list) or not all(isinstance(name, str) and name for name in data):
+        raise ValueError(f"{source}: imports={data!r}. Allowed: a list of names of modules.")
+    return tuple(data)
 
 
 def _lacks(data: Mapping[str, Any], whole: Mapping[str, Any]) -> bool:

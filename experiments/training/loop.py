@@ -6,7 +6,6 @@ host all seeds act in one.
 
 import dataclasses
 import time
-from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -15,34 +14,27 @@ import numpy as np
 from envs.base import Environment
 from experiments.runs import console
 from experiments.runs.config import RunConfig
-from experiments.runs.directory import RunDirectory, Status
+from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
+from experiments.runs.schedule import due, gap, on_schedule, rounds
 from experiments.runs.spec import RunSpec
+from experiments.runs.status import Status
 from experiments.training import record
 from experiments.training.evaluate import make_evaluate
-from experiments.training.programs import NEWER, Programs, RunState, make_programs
+from experiments.training.programs import OLDER, Programs, RunState, make_programs
 from jaxplore.exploration import Explorer
 from jaxplore.types import Transition
 
 
-def rounds(config: RunConfig, start: int) -> Iterator[tuple[int, int]]:
-    """The steps `(first, end)` of each round from `start` on: at most `steps_per_round` long, ending with the warm-up,
-    then at each multiple of `steps_per_round`, and with the run.
-    """
-    length, warm_up = config.explorer.steps_per_round, config.explorer.warm_up_steps
-    while start < config.steps:
-        end = min(warm_up, start + length) if start < warm_up else (start // length + 1) * length
-        end = min(end, config.steps)
-        yield start, end
-        start = end
-
-
-def due(every: int, first: int, end: int, steps: int) -> bool:
-    """Whether what happens every so many steps, and at the end of a run, happens at the end of a round. 0: never."""
-    return every > 0 and (end // every > first // every or end == steps)
-
-
-def run(spec: RunSpec, directory: RunDirectory, env: Environment, agent: Explorer, *, resume: bool = False) -> RunState:
+def run(
+    spec: RunSpec,
+    directory: RunDirectory,
+    env: Environment,
+    agent: Explorer,
+    programs: Programs | None = None,
+    *,
+    resume: bool = False,
+) -> RunState:
     """Carry out a run, from its latest checkpoint if `resume`, and write what comes of it to its directory.
 
     Args:
@@ -50,6 +42,7 @@ def run(spec: RunSpec, directory: RunDirectory, env: Environment, agent: Explore
         directory: the run's.
         env: the environment that `spec` names.
         agent: the agent that `spec` names.
+        programs: of the run, where they have been made already.
         resume: whether to continue from the latest checkpoint; without one the run starts over.
 
     Returns:
@@ -59,7 +52,7 @@ def run(spec: RunSpec, directory: RunDirectory, env: Environment, agent: Explore
         RunError: the disk fails, a checkpoint does not fit, or no seed is left whose numbers are finite. The latest
             checkpoint is then whole.
     """
-    session = Session(spec, directory, env, agent)
+    session = Session(spec, directory, env, agent, programs or make_programs(spec.config, env, agent))
     session.start(resume=resume)
     try:
         for first, end in rounds(spec.config, session.step):
@@ -79,16 +72,19 @@ class Session:
         directory: where it is written.
         env: the environment.
         agent: the agent.
+        programs: its functions.
     """
 
     state: RunState
     step: int
     """Environment steps taken."""
 
-    def __init__(self, spec: RunSpec, directory: RunDirectory, env: Environment, agent: Explorer) -> None:
+    def __init__(
+        self, spec: RunSpec, directory: RunDirectory, env: Environment, agent: Explorer, programs: Programs
+    ) -> None:
         self.spec, self.directory, self.env, self.agent = spec, directory, env, agent
         self.config: RunConfig = spec.config
-        self.programs: Programs = make_programs(spec.config, env, agent)
+        self.programs: Programs = programs
         evaluates = spec.config.eval_every > 0
         self.evaluate = make_evaluate(spec.config, env, agent, self.programs) if evaluates else None
         self.checkpoints, self.log = directory.checkpoints(), directory.metrics_log()
@@ -97,13 +93,15 @@ class Session:
     def start(self, *, resume: bool) -> None:
         """Take up the state to continue from, and open what is written to."""
         state, self.step, earlier = self.programs.init(), 0, 0.0
-        restored = self.checkpoints.restore_latest(state, newer=NEWER) if resume else None
+        usable = on_schedule(self.config, self.checkpoints.steps())
+        restored = self.checkpoints.restore_latest(state, usable, OLDER) if resume and usable is not None else None
         if restored is None and self.spec.parent is not None:
             from experiments.training import parent  # Which restores states by this module.
 
             state = parent.adopt(state, self.spec.parent, self.agent)
         if restored is not None:
             self._check_identity(restored.meta)
+            self._check_rows(restored.step)
             self.step, state, earlier = restored.step, restored.state, restored.meta["wall_time"]
         self.began = time.monotonic() - earlier
         # Written in place; a restored array may be read-only.
@@ -122,12 +120,30 @@ class Session:
     def _check_identity(self, meta: dict[str, Any]) -> None:
         """A checkpoint is of the run that its directory says."""
         saved = meta.get("identity")
-        if saved is not None and saved != self.spec.identity:
+        # It may be of before the run was made longer.
+        then = dataclasses.replace(self.config, steps=meta.get("steps", self.config.steps))
+        if saved is not None and saved != dataclasses.replace(self.spec, config=then).identity:
             raise RunError(
                 f"the checkpoints in {self.directory} are of another run: their identity is {saved}, and the "
                 f"configuration has {self.spec.identity}. What to do: put back the run's own files, or start a new run "
                 "with another --out."
             )
+
+    def _check_rows(self, step: int) -> None:
+        """The rows up to the checkpoint are as they were written: what is missing there is never written again."""
+        path = self.directory.metrics_path
+        damage = gap(self.config, self.directory.rows() if path.exists() else [], step)
+        if damage is None:
+            return
+        good, what = damage
+        steps = self.checkpoints.steps()
+        older = [f"{self.checkpoints.directory / str(one)}" for one in steps if one > good]
+        usable = on_schedule(self.config, [one for one in steps if one <= good])
+        remedy = f", or remove {' and '.join(older)} to continue from the one of step {usable:,}" if usable else ""
+        raise RunError(
+            f"{path} {what}, from before its checkpoint of step {step:,}. What to do: put back a copy of the "
+            f"file{remedy}, or start a new run with another --out."
+        )
 
     def close(self) -> None:
         """End the progress bar and close the files."""
@@ -190,7 +206,7 @@ class Session:
 
     def _save(self, step: int, state: RunState | None = None) -> None:
         self.log.sync()
-        meta = {"wall_time": time.monotonic() - self.began, "identity": self.spec.identity}
+        meta = {"wall_time": time.monotonic() - self.began, "identity": self.spec.identity, "steps": self.config.steps}
         self.checkpoints.save(step, state or self.state, meta)
 
     def _announce(self, what: str) -> None:
@@ -237,7 +253,7 @@ def last_state(
     """
     config, checkpoints = directory.config(), directory.checkpoints()
     programs = make_programs(config, env, agent)
-    restored = checkpoints.restore_latest(programs.stepper.abstract(programs.init), until, NEWER)
+    restored = checkpoints.restore_latest(programs.stepper.abstract(programs.init), until, OLDER)
     if restored is None and checkpoints.steps():
         raise RunError(f"{directory} has no checkpoint up to step {until}, only of {checkpoints.steps()}.")
     if restored is None:

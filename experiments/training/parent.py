@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 
 from envs.base import Environment
-from experiments.runs.directory import RunDirectory, Status
+from experiments.runs.directory import RunDirectory
 from experiments.runs.spec import RunRef
+from experiments.runs.status import Status
 from experiments.training import build
 from experiments.training.loop import last_state
 from experiments.training.programs import RunState

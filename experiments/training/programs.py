@@ -17,6 +17,7 @@ from envs import coverage
 from envs.base import Coverage, Environment
 from envs.functional import all_finite
 from envs.stepper import Stepper, make_stepper
+from experiments.runs.codec import Allowances
 from experiments.runs.config import RunConfig
 from jaxplore.exploration import Actor, Explorer, ExplorerState
 from jaxplore.types import Array, Key, Metrics, Transition
@@ -24,8 +25,8 @@ from jaxplore.types import Array, Key, Metrics, Transition
 INIT, RESET, COLLECT, LEARN, EVALUATE = range(5)
 """What a key is for; folded into the seed's key before the step."""
 
-NEWER = {"alive": True, "episode_return": 0.0, "episode_length": 0}
-"""Leaves of a `RunState` that older checkpoints lack, and what they are then full of."""
+OLDER = Allowances({"alive": True, "episode_return": 0.0, "episode_length": 0}, ("positions", "episode_steps"))
+"""In what the `RunState` of an older checkpoint, or of a shorter run, differs."""
 
 
 @struct.dataclass
@@ -63,6 +64,11 @@ class Programs(NamedTuple):
     """`learn(step, state, transitions, valid, obs, num_data, alive) -> (state, metrics, finite)`: assess transitions,
     take them in, and improve. `finite` says of each metric and each part of the state whether it is, `[S]`; a seed
     where one is not, or which is not alive, has the state that it had."""
+    trace_init: Callable[[], ExplorerState]
+    """The explorers' part of the first state, as shapes."""
+    trace_learn: Callable[..., Any]
+    """`trace_learn(state, (transitions, valid), obs, num_data, alive) -> jaxpr` of `learn`, which is then not traced
+    again; shapes do."""
     mark: Callable[[np.ndarray, Array, Array], Array]
     """`mark(visited [S, cells], obs [S, T, O], valid [S, T]) -> visited`."""
     keys: Callable[[int, int], Key]
@@ -75,15 +81,18 @@ def make_programs(config: RunConfig, env: Environment, explorer: Explorer) -> Pr
     seed_keys = jax.vmap(jax.random.key)(jnp.arange(config.seed, config.seed + config.num_seeds))
     keys = jax.jit(functools.partial(derive_keys, seed_keys))
     stepper = make_stepper(env, config.explorer.steps_per_round, explorer.act)
+    init_all = jax.jit(jax.vmap(explorer.init))
     learn_all = jax.jit(functools.partial(learn_side_by_side, explorer), donate_argnums=1)
     return Programs(
-        init=functools.partial(init_state, config, env, explorer, stepper, keys),
+        init=functools.partial(init_state, config, env, init_all, stepper, keys),
         actors=jax.jit(jax.vmap(explorer.actor, in_axes=(0, None))),
         collect=lambda step, *args: stepper.collect(keys(COLLECT, step), *args),
         absorb=jax.jit(jax.vmap(explorer.observe), donate_argnums=0),
         learn=lambda step, state, transitions, valid, *rest: learn_all(
             keys(LEARN, step), state, (transitions, valid), *rest
         ),
+        trace_init=lambda: jax.eval_shape(init_all, jax.eval_shape(keys, INIT, 0)),
+        trace_learn=lambda *args: learn_all.trace(jax.eval_shape(keys, LEARN, 0), *args).jaxpr,
         mark=jax.jit(jax.vmap(functools.partial(mark_cells, env.coverage))),
         keys=keys,
         stepper=stepper,
@@ -96,13 +105,17 @@ def derive_keys(seed_keys: Key, purpose: int, step: int) -> Key:
 
 
 def init_state(
-    config: RunConfig, env: Environment, explorer: Explorer, stepper: Stepper, keys: Callable[[int, int], Key]
+    config: RunConfig,
+    env: Environment,
+    init_all: Callable[[Key], ExplorerState],
+    stepper: Stepper,
+    keys: Callable[[int, int], Key],
 ) -> RunState:
     """The state that a run starts from."""
     num_seeds, steps = config.num_seeds, config.steps if env.floor_plan else 0
     return RunState(
         env=stepper.init(keys(RESET, 0)),
-        explorer=jax.jit(jax.vmap(explorer.init))(keys(INIT, 0)),
+        explorer=init_all(keys(INIT, 0)),
         visited=np.zeros((num_seeds, env.coverage.num_cells), bool),
         positions=np.zeros((num_seeds, steps, 2), np.float32),
         episode_steps=np.zeros((num_seeds, steps), np.int32),

@@ -10,6 +10,7 @@ import pytest
 
 from experiments import compare
 from experiments.analysis import statistics
+from experiments.runs import schedule
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
 from experiments.runs.presets import preset_config
@@ -23,7 +24,7 @@ def write_run(path: Path, method: str, seed: int, reached: list[int], steps: int
     config = dataclasses.replace(preset_config("laptop"), method=method, seed=seed, steps=steps)
     (path / "config.json").write_text(to_json(RunSpec(config)))
     rows = []
-    for step in range(25, steps + 1, 25):
+    for _, step in schedule.rounds(config, 0):
         cells = sum(at <= step for at in reached)
         rows.append({"step": step, "seed": seed, "coverage": cells / 7, "cells": cells, "wall_time": step * 0.06})
     (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))

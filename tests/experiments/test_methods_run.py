@@ -95,7 +95,7 @@ def test_a_flag_that_does_nothing_is_refused(
 
 def test_help_shows_first_what_the_method_reads(capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit):
-        run.main(["--method=rnd", "--help"])
+        run.main(["--method=rnd", "--help=all"])
     text = capsys.readouterr().out
     assert max(map(text.index, ("--rnd.lr", "--ppo.lr"))) < min(map(text.index, ("--sac.lr", "--svgd.kernel")))
 

@@ -12,11 +12,12 @@ import pytest
 import envs
 from envs import stepper
 from experiments import run
+from experiments.runs import schedule
 from experiments.runs.checkpoint import Checkpoints
 from experiments.runs.directory import RunDirectory
 from experiments.runs.metrics import MetricsLog
 from experiments.runs.tensorboard import TensorBoardLog
-from experiments.training import build, loop
+from experiments.training import build
 from tests.experiments import tiny
 from tests.experiments.tiny import ROOT, STEPS, TINY, assert_same_run, rows
 
@@ -205,15 +206,15 @@ def test_each_program_is_traced_once(
 
 def test_rounds_start_where_they_would_have():
     config = run.parse(["--preset=smoke", "--steps=601"])[1].config
-    whole = list(loop.rounds(config, 0))
+    whole = list(schedule.rounds(config, 0))
     assert whole[0] == (0, 25)
     assert (250, 256) in whole
     assert (256, 275) in whole
     assert whole[-1] == (600, 601)
     assert [first for first, _ in whole[1:]] == [end for _, end in whole[:-1]]
     for start_again in (end for _, end in whole):
-        assert list(loop.rounds(config, start_again)) == [step for step in whole if step[0] >= start_again]
-    assert list(loop.rounds(config, 601)) == []
+        assert list(schedule.rounds(config, start_again)) == [step for step in whole if step[0] >= start_again]
+    assert list(schedule.rounds(config, 601)) == []
 
 
 def test_the_point_is_what_it_is_said_to_be():

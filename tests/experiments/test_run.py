@@ -16,14 +16,15 @@ from matplotlib.image import imread
 
 import envs
 from experiments import run
-from experiments.runs import console, metrics
+from experiments.runs import console, metrics, place
 from experiments.runs.checkpoint import Checkpoints
 from experiments.runs.config import PRESETS, flag
-from experiments.runs.directory import RunDirectory, Status
+from experiments.runs.directory import RunDirectory
 from experiments.runs.flags import document
 from experiments.runs.presets import preset_config
 from experiments.runs.spec import RunSpec, from_json, to_json
-from experiments.training import loop, record
+from experiments.runs.status import Status
+from experiments.training import record
 from jaxplore import beliefs, methods
 from jaxplore.methods import Method
 from tests.experiments.tiny import CELLS, ROOT, STEPS, TINY, assert_same_run, leaves, make_point, rows
@@ -173,9 +174,9 @@ def test_a_run_shorter_than_its_pictures_have_panels(tell, point: str, tmp_path:
 def test_without_out_a_run_makes_its_own_place(point: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     command, spec = run.parse(["--env=point", "--method=random", "--seed=3"])
-    assert run.choose_directory(command, spec).path == Path("runs/point-random-laptop-seed3")
+    assert place.choose(command.out, spec, resume=False).path == Path("runs/point-random-laptop-seed3")
     (tmp_path / "runs/point-random-laptop-seed3").mkdir(parents=True)
-    assert run.choose_directory(command, spec).path == Path("runs/point-random-laptop-seed3-2")
+    assert place.choose(command.out, spec, resume=False).path == Path("runs/point-random-laptop-seed3-2")
 
 
 # Flags.
@@ -221,7 +222,7 @@ def test_help_shows_every_setting_with_its_default(
 ):
     monkeypatch.setenv("COLUMNS", "100")
     with pytest.raises(SystemExit) as stop:
-        run.main([f"--preset={preset}", "--help"])
+        run.main([f"--preset={preset}", "--help=all"])
     assert stop.value.code == 0
     text = capsys.readouterr().out
     assert max(map(len, text.splitlines())) <= 100
@@ -378,7 +379,8 @@ def test_resume_with_another_configuration_names_the_differences(small, tell):
     assert told.status == 2
     assert (
         f"--resume: the configuration disagrees with the one saved in {small.out} in method: 'random' -> 'implicit'; "
-        "seed: 0 -> 4; sac.lr: 0.001 -> 0.5. Resume with the saved values, or start a run in another --out."
+        "seed: 0 -> 4; sac.lr: 0.001 -> 0.5. Resume with the saved values (or more steps), or start a run in another "
+        "--out."
     ) in told.stderr
 
 
@@ -524,7 +526,7 @@ def fragile(monkeypatch: pytest.MonkeyPatch):
 
         row = Method("breaks", belief, methods.no_reward, methods.uniform_actions)
         monkeypatch.setitem(methods.METHODS, "fragile", row)
-        original = loop.make_programs
+        original = run.make_programs
 
         def make_programs(config, env, explorer):
             programs = original(config, env, explorer)
@@ -537,7 +539,7 @@ def fragile(monkeypatch: pytest.MonkeyPatch):
 
             return programs._replace(init=init)
 
-        monkeypatch.setattr(loop, "make_programs", make_programs)
+        monkeypatch.setattr(run, "make_programs", make_programs)
 
     return make
 

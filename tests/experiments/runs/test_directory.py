@@ -12,11 +12,12 @@ import envs
 from envs.base import FloorPlan
 from experiments.analysis import load
 from experiments.runs import scene, spec
-from experiments.runs.directory import RunDirectory, Status
+from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
 from experiments.runs.presets import preset_config
 from experiments.runs.scene import Cells, Scene
 from experiments.runs.spec import RunRef, RunSpec
+from experiments.runs.status import Status
 from experiments.training import build
 from tests.experiments.tiny import ROOT
 
@@ -64,13 +65,13 @@ def test_a_scene_comes_back_as_it_was():
     config = preset_config("smoke", "nchain")
     env = build.make_env(config)
     own = build.make_scene(config, env, build.make_agent(config, env))
-    assert scene.from_json(scene.to_json(own)) == own
+    assert scene.from_json(json.loads(scene.to_json(own))) == own
     assert (own.coverage, own.episode_steps, own.variance_unit) == (Cells(40, "states"), 49, "probability, squared")
     assert own.reward_unit == "probability, squared" and own.has_reward and own.floor_plan is None
     assert Cells(512, "cells", 256).size == envs.base.Coverage(512, lambda obs: obs, "cells", 256).size
-    assert scene.from_json(scene.to_json(SCENE)) == SCENE
+    assert scene.from_json(json.loads(scene.to_json(SCENE))) == SCENE
     with pytest.raises(ValueError, match="not a scene"):
-        scene.from_json("{}")
+        scene.from_json({})
 
 
 # Specifications.

@@ -215,5 +215,9 @@ def test_a_saved_configuration_names_every_field():
         return {path for name, inner in value.items() for path in keys(inner, f"{prefix}.{name}")}
 
     saved = json.loads(to_json(RunConfig()))
-    assert {saved.pop("format"), saved.pop("parent")} == {1, None} and len(saved.pop("identity")) == 16
+    assert (
+        {saved.pop("format"), saved.pop("parent")} == {1, None}
+        and saved.pop("imports") == []
+        and len(saved.pop("identity")) == 16
+    )
     assert keys(saved) == paths(RunConfig())
