@@ -37,6 +37,8 @@ FRICTION = (1.0, 0.5, 0.5)
 TORSO_HEIGHT = 0.75
 RESET_SCALE = 0.1
 WALL_HEIGHT = 6.0
+DRAWN_HEIGHT = 0.25
+"""Of the walls in pictures, which are cut there: higher ones would hide the ant."""
 MAX_CONTACTS = 24
 """Contacts that MJX solves for, the deepest of the 150 that it looks for. The ant was never seen with more than 7."""
 PITCH = 2.0
@@ -84,7 +86,7 @@ def make_model() -> mujoco.MjModel:
 
     Walls touch every part of the ant, as the floor does; the ant's own parts do not touch each other. The four outer
     walls are boxes to the eye only: what the ant meets are planes in their inner faces, cheaper in MJX, the same in
-    both engines, and never tunnelled through.
+    both engines, and never tunnelled through. What pictures show of all five are sites, cut low.
     """
     spec = mujoco.MjSpec.from_file(str(resources.files("gymnasium") / "envs" / "mujoco" / "assets" / "ant.xml"))
     spec.modelname = SPEC.name
@@ -130,16 +132,22 @@ def make_model() -> mujoco.MjModel:
 
 
 def _light(spec: mujoco.MjSpec) -> None:
-    """What only pictures need: colours, lights and two cameras. Physics does not see it."""
+    """What only pictures need: cut walls, colours, lights and two cameras. Physics does not see it."""
     light_gymnasium_floor(spec)
-    for index in range(len(WALLS)):
-        spec.geom(f"wall_{index}").rgba = (0.20, 0.34, 0.56, 0.5)
+    for index, (x_min, y_min, x_max, y_max) in enumerate(WALLS):
+        spec.geom(f"wall_{index}").rgba = (0.0, 0.0, 0.0, 0.0)
+        spec.worldbody.add_site(
+            name=f"wall_{index}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=((x_min + x_max) / 2, (y_min + y_max) / 2, DRAWN_HEIGHT / 2),
+            size=((x_max - x_min) / 2, (y_max - y_min) / 2, DRAWN_HEIGHT / 2),
+            rgba=(0.42, 0.53, 0.70, 1.0),
+        )
     for index in range(len(SIDES)):
         spec.geom(f"side_{index}").rgba = (0.0, 0.0, 0.0, 0.0)
-    # From far above, so that walls 6 m high hide little of the floor.
     spec.worldbody.add_camera(name="overview", pos=(2, 2, 46), fovy=15)
     track = spec.camera("track")
-    track.pos, track.alt.xyaxes = (0, -2.5, 5.5), (1, 0, 0, 0, 0.91, 0.41)
+    track.pos, track.alt.xyaxes = (0, -1.8, 5.8), (1, 0, 0, 0, 0.955, 0.296)
 
 
 def start(key: Key) -> tuple[Array, Array]:

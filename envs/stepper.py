@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs.base import Environment, EnvState
+from envs.errors import EnvironmentFault, raised, shape_of
 from jaxplore import validate
 from jaxplore.types import Array, Key, Transition
 from jaxplore.validate import FieldError
@@ -41,8 +42,8 @@ def make_collect(env: Environment, capacity: int) -> Collect:
         capacity: rows that `collect` returns; `num_steps` of them are steps, the others zeros.
 
     Returns:
-        `collect`. `valid` marks the rows that are steps with finite observations: physics that diverges leaves a row
-        that is none. On the host `collect` raises `FieldError` for `num_steps` outside 1 to `capacity`.
+        `collect`. `valid` marks the rows that are steps with finite observations and rewards: physics that diverges
+        leaves a row that is none. On the host `collect` raises `FieldError` for `num_steps` outside 1 to `capacity`.
 
     Raises:
         FieldError: `capacity` below 1.
@@ -65,7 +66,7 @@ def _collect_compiled(
     shapes = jax.eval_shape(lambda: env.step(env_state, act(key, env_state.obs))[1])
     rows = jax.tree.map(lambda leaf: jnp.zeros((capacity, *leaf.shape), leaf.dtype), shapes)
     _, env_state, rows = jax.lax.fori_loop(0, num_steps, one_step, (key, env_state, rows))
-    finite = jnp.all(jnp.isfinite(rows.obs) & jnp.isfinite(rows.next_obs), axis=-1)
+    finite = jnp.all(jnp.isfinite(rows.obs) & jnp.isfinite(rows.next_obs), axis=-1) & jnp.isfinite(rows.reward)
     return env_state, rows, finite & (jnp.arange(capacity) < num_steps)
 
 
@@ -128,7 +129,7 @@ def _collect_side_by_side(
             states = tuple(fresh.get(i, state) for i, state in enumerate(states))
     transitions += [jax.tree.map(np.zeros_like, transitions[-1])] * (capacity - num_steps)
     rows = jax.tree.map(lambda *leaves: np.stack(leaves, axis=1), *transitions)
-    finite = np.all(np.isfinite(rows.obs) & np.isfinite(rows.next_obs), axis=-1)
+    finite = np.all(np.isfinite(rows.obs) & np.isfinite(rows.next_obs), axis=-1) & np.isfinite(rows.reward)
     return states, rows, finite & (np.arange(capacity) < num_steps)
 
 
@@ -205,6 +206,7 @@ def make_stepper(env: Environment, capacity: int, act: ActAs) -> Stepper:
     Raises:
         FieldError: `capacity` below 1.
     """
+    env = _checked(env)
     if env.compiled:
         return Stepper(
             init=jax.jit(jax.vmap(env.reset)),
@@ -223,6 +225,42 @@ def make_stepper(env: Environment, capacity: int, act: ActAs) -> Stepper:
         compiles=False,
         abstract=lambda init: init(),
     )
+
+
+def _checked(env: Environment) -> Environment:
+    """The same environment; what its functions raise, and shapes that are not its spec's, come as `EnvironmentFault`.
+
+    On the device that happens when it is traced, and costs nothing when it is run.
+    """
+    name, obs_shape = env.spec.name, (env.spec.obs_size,)
+
+    def check_obs(when: str, obs: Any) -> None:
+        if jnp.shape(obs) != obs_shape:
+            expected = f"shape {obs_shape}, an entry for each of the spec's obs_names"
+            raise EnvironmentFault(name, when, f"returned an observation of {shape_of(obs)}", expected)
+
+    def call(when: str, expected: str, function: Callable[..., Any], *args: Any) -> Any:
+        try:
+            return function(*args)
+        except (EnvironmentFault, FieldError):
+            raise
+        except Exception as error:  # A function of anybody's raises anything.
+            raise EnvironmentFault(name, when, raised(error), expected) from error
+
+    def reset(key: Key) -> EnvState:
+        state = call("reset", "an EnvState", env.reset, key)
+        check_obs("reset", state.obs)
+        return state
+
+    def step(state: EnvState, action: Array) -> tuple[EnvState, Transition]:
+        found = call("step", "an EnvState and a Transition", env.step, state, action)
+        if not isinstance(found, tuple) or len(found) != 2:
+            what = f"{len(found)} values" if isinstance(found, tuple) else type(found).__name__
+            raise EnvironmentFault(name, "step", f"returned {what}", "an EnvState and a Transition")
+        check_obs("step", found[1].next_obs)
+        return found
+
+    return dataclasses.replace(env, reset=reset, step=step)
 
 
 def _collect_on_device(

@@ -5,17 +5,18 @@ Runs of one method with different settings are kept apart by a name of your own 
 
 import argparse
 import json
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from experiments import process
 from experiments.analysis import figures
 from experiments.analysis.comparison import belief_table, calibration_table, coverage_table
 from experiments.analysis.statistics import Group, group
 from experiments.analysis.tables import duration
+from experiments.runs import modules
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError, disk_error
 from experiments.runs.files import write_text
@@ -77,10 +78,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--keep", type=Path, help="also copy what a comparison needs of each run to this directory; they are runs, too"
     )
+    modules.add_flag(parser)
+    process.add_flag(parser)
     arguments = parser.parse_args(argv)
     if arguments.until is not None and arguments.until < 1:
         parser.error(f"--until={arguments.until}. Allowed: 1 or more.")
     try:
+        modules.load(arguments.imports)
         names, runs = zip(*map(split_name, arguments.runs), strict=True)
         text = write(runs, names, arguments.out, arguments.until)
         if arguments.keep:
@@ -90,15 +94,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             except OSError as error:
                 raise disk_error("keep the runs", arguments.keep, error) from error
         print(text)
-        sys.stdout.flush()
     except (RunError, ValueError) as error:
         print(f"error: {error}", file=sys.stderr)
+        process.show_cause(error, debug=arguments.debug)
         return 1
-    except BrokenPipeError:
-        # The reader, such as `head`, has seen enough; nothing is left to be flushed at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    process.carry_out(main)

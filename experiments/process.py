@@ -1,5 +1,6 @@
 """How the command lines behave as processes: interrupted, terminated, or with nobody left who reads what they print."""
 
+import argparse
 import contextlib
 import os
 import signal
@@ -57,13 +58,23 @@ def carry_out(main: Callable[[], int]) -> None:
         signal.signal(signal.SIGTERM, _terminate)
         if hasattr(signal, "SIGHUP"):
             signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    sys.exit(main())
+    try:
+        status = main()
+    except KeyboardInterrupt as stop:
+        print("\nStopped.", file=sys.stderr)
+        status = status_of(stop)
+    sys.exit(status)
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:
     # Once: what it unwinds is not to be stopped a second time.
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     raise Terminated
+
+
+def add_flag(parser: argparse.ArgumentParser) -> None:
+    """Give a command line `--debug`, for `show_cause`."""
+    parser.add_argument("--debug", action="store_true", help="show the traceback below the message of an error")
 
 
 def show_cause(error: BaseException, *, debug: bool) -> None:

@@ -41,7 +41,7 @@ class CommandLine:
     out: str | None = None
     """Directory of the run. By default a new one: runs/ENV-METHOD-PRESET-seedN."""
     resume: bool = False
-    """Continue the run in --out from its latest checkpoint; with a larger --steps, make it that much longer."""
+    """Continue the run in --out from its latest checkpoint; with more steps, make it that much longer."""
     config: str | None = None
     """A config.json to start from, as every run saves it; other flags come on top."""
     parent: str | None = None

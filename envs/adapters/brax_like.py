@@ -79,7 +79,8 @@ def _reset(env: Any, key: Key) -> Any:
 
 def _advance(env: Any, key: Key, state: Any, action: Array) -> Any:
     with jax.numpy_rank_promotion("allow"):
-        after = env.step(state, action)
+        # In containers of its own: some change the state that they are given, its metrics above all.
+        after = env.step(jax.tree.map(lambda leaf: leaf, state), action)
     # In the types of the state before, so that loops can carry it.
     return jax.tree.map(lambda new, old: jnp.asarray(new, jnp.asarray(old).dtype), after, state)
 

@@ -16,10 +16,11 @@ environment depends on its seed and its actions alone; one that does not is foun
 # pyright: reportArgumentType=false, reportReturnType=false, reportAttributeAccessIssue=false
 # NumPy arrays stand where the contract says Array, and mujoco ships no stubs.
 
+import difflib
 import functools
-import importlib
 import numbers
-from collections.abc import Iterable, Iterator
+import sys
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -32,6 +33,7 @@ from gymnasium.vector import AutoresetMode
 
 from envs.base import Environment, EnvSpec, EnvState, View, check_noise
 from envs.coverage import make_generic_coverage
+from envs.errors import EnvironmentFault, raised, shape_of
 from jaxplore import validate
 from jaxplore.types import Key, Transition
 from jaxplore.validate import FieldError
@@ -39,6 +41,10 @@ from jaxplore.validate import FieldError
 BACKEND = "gymnasium"
 EPISODE_STEPS = 1_000
 """Where an environment is registered without a time limit."""
+LARGEST = 1e18
+"""Size of an observation beyond which physics is taken to have diverged: its square is no float32."""
+NEIGHBOURS = 5
+"""Ids that are named where one is not known."""
 
 
 @struct.dataclass
@@ -54,15 +60,17 @@ class Past:
 
 
 def check_name(name: str) -> None:
-    """Raise `FieldError` unless `name` is an id in Gymnasium's registry, or `module:id`, to import first."""
+    """Raise `FieldError` unless `name` is an id in Gymnasium's registry, or `module:id` of a module that has been
+    imported: a name may come from a file, and importing a module runs it.
+    """
     module, colon, env_id = name.rpartition(":")
-    if colon:
-        try:
-            importlib.import_module(module)
-        except ImportError as error:
-            problem = f"cannot be made here: cannot import {module!r} ({error}). Install it."
-            raise FieldError("env", f"gymnasium:{name}", "modules that can be imported", problem) from error
-    validate.one_of("env", f"gymnasium:{env_id}", (f"gymnasium:{known}" for known in registry))
+    if colon and module not in sys.modules:
+        problem = f"needs the module {module!r}, which has not been imported"
+        raise FieldError("env", f"gymnasium:{name}", f"with --import={module}, or after `import {module}`", problem)
+    if env_id not in registry:
+        close = [f"gymnasium:{near}" for near in difflib.get_close_matches(env_id, registry, n=NEIGHBOURS, cutoff=0.0)]
+        allowed = f"an id that Gymnasium knows; the nearest are {', '.join(close)}"
+        raise FieldError("env", f"gymnasium:{name}", allowed, f"is not known. Did you mean {close[0]!r}?")
 
 
 class Adapted(NamedTuple):
@@ -266,11 +274,9 @@ class Live:
 
     def _check(self, obs: np.ndarray, past: Past) -> None:
         if not np.array_equal(obs, past.obs, equal_nan=True):
-            problem = (
-                "went elsewhere from the same seed under the same actions, so it cannot continue from a saved state"
-            )
-            allowed = "environments that depend on their seed and actions alone"
-            raise FieldError("env", f"gymnasium:{self._id}", allowed, problem)
+            problem = "went elsewhere from the same seed under the same actions, so it cannot be resumed,"
+            expected = "an environment that depends on its seed and actions alone"
+            raise EnvironmentFault(f"gymnasium:{self._id}", "its second time there", problem, expected)
 
     def _make_vector(self, size: int) -> gymnasium.vector.SyncVectorEnv:
         vector = gymnasium.make_vec(
@@ -278,6 +284,7 @@ class Live:
             size,
             vectorization_mode="sync",
             vector_kwargs={"autoreset_mode": AutoresetMode.DISABLED},
+            wrappers=[functools.partial(Checked, env_id=self._id)],
             **OPTIONS,
         )
         assert isinstance(vector, gymnasium.vector.SyncVectorEnv)
@@ -293,11 +300,90 @@ OPTIONS: dict[str, Any] = {"max_episode_steps": -1, "disable_env_checker": True}
 def _make(env_id: str, **options: Any) -> gymnasium.Env:
     try:
         env = gymnasium.make(env_id, **OPTIONS, **options)
-    except (gymnasium.error.Error, ImportError) as error:
-        problem = f"cannot be made here: {str(error).rstrip('.')}"
+    except Exception as error:  # An environment of anybody's raises anything.
+        known = isinstance(error, gymnasium.error.Error | ImportError)
+        problem = f"cannot be made here: {str(error).rstrip('.') if known else raised(error)}"
         raise FieldError("env", f"gymnasium:{env_id}", "environments that `gymnasium.make` makes", problem) from error
     _keep_divergence(env)
-    return env
+    return Checked(env, env_id)
+
+
+class Checked(gymnasium.Wrapper):
+    """An environment of anybody's: what it raises, and what it may not give back, is said in a line.
+
+    Args:
+        env: the environment.
+        env_id: in Gymnasium's registry.
+
+    Raises:
+        EnvironmentFault: from `reset` and `step`.
+    """
+
+    def __init__(self, env: gymnasium.Env, env_id: str) -> None:
+        super().__init__(env)
+        self._name, self._steps = f"gymnasium:{env_id}", 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode."""
+        self._steps = 0
+        expected = "an observation and a dictionary"
+        found = self._call(expected, functools.partial(self.env.reset, seed=seed, options=options))
+        self._check_count(found, 2, expected)
+        obs = self._check_obs(found[0])
+        if not np.isfinite(obs).all():
+            raise self._fault("returned an observation with numbers that are not finite", "finite numbers")
+        return found
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """Take a step."""
+        self._steps += 1
+        expected = "an observation, a reward, terminated, truncated and a dictionary"
+        found = self._call(expected, functools.partial(self.env.step, action))
+        self._check_count(found, 5, expected)
+        obs = self._check_obs(found[0])
+        try:
+            reward = float(np.asarray(found[1]).item())
+        except (TypeError, ValueError) as error:
+            raise self._fault(f"returned a reward of {shape_of(found[1])}", "one number") from error
+        # Physics that diverges is dropped, the reward with it; without that, somebody would learn from it.
+        if np.isfinite(obs).all() and not abs(reward) <= LARGEST:
+            raise self._fault(f"returned the reward {reward}", f"a number between -{LARGEST:g} and {LARGEST:g}")
+        return found
+
+    def _call(self, expected: str, function: Callable[[], Any]) -> Any:
+        try:
+            return function()
+        except Exception as error:
+            raise self._fault(raised(error), expected) from error
+
+    def _check_count(self, found: Any, count: int, expected: str) -> None:
+        if not isinstance(found, tuple) or len(found) != count:
+            what = f"{len(found)} values" if isinstance(found, tuple) else type(found).__name__
+            raise self._fault(f"returned {what}", expected)
+
+    def _check_obs(self, obs: Any) -> np.ndarray:
+        space = self.env.observation_space
+        if isinstance(space, spaces.Discrete):
+            if not space.contains(obs):
+                raise self._fault(f"returned the observation {obs!r}", f"one of {space}")
+            return np.zeros(0)
+        parts = dict(space.spaces) if isinstance(space, spaces.Dict) else {"": space}
+        if isinstance(space, spaces.Dict) and (not isinstance(obs, dict) or set(obs) != set(parts)):
+            names = ", ".join(obs) if isinstance(obs, dict) else type(obs).__name__
+            raise self._fault(f"returned the observation {names}", f"a dictionary with {', '.join(parts)}")
+        found = []
+        for name, part in parts.items():
+            own = obs[name] if name else obs
+            if np.shape(np.asarray(own)) != part.shape:
+                what = f"an observation {f'{name} ' if name else ''}of {shape_of(np.asarray(own))}"
+                raise self._fault(f"returned {what}", f"shape {part.shape}, as its space says")
+            found.append(np.asarray(own, float).ravel())
+        return np.concatenate(found)
+
+    def _fault(self, found: str, expected: str) -> EnvironmentFault:
+        return EnvironmentFault(
+            self._name, f"step {self._steps} of an episode" if self._steps else "reset", found, expected
+        )
 
 
 def _keep_divergence(env: gymnasium.Env) -> None:
@@ -371,9 +457,9 @@ def _flat(space: spaces.Space, obs: Any) -> np.ndarray:
     """An observation as the contract has it, float32 `[O]`."""
     if isinstance(space, spaces.Discrete):
         return np.eye(int(space.n), dtype=np.float32)[int(obs) - int(space.start)]
-    if isinstance(space, spaces.Dict):
-        return np.concatenate([np.asarray(obs[name], np.float32) for name in space.spaces])
-    return np.array(obs, np.float32)
+    parts = [obs[name] for name in space.spaces] if isinstance(space, spaces.Dict) else [obs]
+    flat = np.concatenate([np.asarray(part, float) for part in parts])
+    return np.where(np.abs(flat) <= LARGEST, flat, np.nan).astype(np.float32)
 
 
 def _native(space: spaces.Space, action: np.ndarray) -> Any:

@@ -10,9 +10,11 @@ import numpy as np
 from experiments.runs.config import RunConfig
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
+from experiments.runs.rows import check
 from experiments.runs.scene import Scene
 from experiments.runs.schedule import gap
 from experiments.runs.status import Status
+from jaxplore.validate import FieldError
 
 
 class LoadedRun(NamedTuple):
@@ -47,6 +49,14 @@ def load(path: Path, until: int | None = None) -> LoadedRun:
             f"--until={damage[0]} or less."
         )
     scene = scene_of(directory)
+    for row in rows:
+        try:
+            check(row, scene.coverage.num_cells)
+        except FieldError as error:
+            raise RunError(
+                f"{directory.metrics_path}, step {row['step']} of seed {row['seed']}: {error} What to do: put back a "
+                "copy of the file."
+            ) from error
     if until is None:
         return LoadedRun(directory, config, rows, scene)
     rows = [row for row in rows if row["step"] <= until]

@@ -28,6 +28,7 @@ from experiments import runtime
 from experiments.runs import lock
 from experiments.runs import scene as scenes
 from experiments.runs import spec as specs
+from experiments.runs.asked import is_calibration
 from experiments.runs.checkpoint import Checkpoints
 from experiments.runs.config import RunConfig
 from experiments.runs.errors import RunError, disk_error
@@ -175,8 +176,8 @@ class RunDirectory:
             if (self.path / name).exists():
                 try:
                     found = read_json(self.path / name)
-                    if not isinstance(found.get("step"), int) or not isinstance(found.get("seeds"), list):
-                        raise ValueError("it lacks step or seeds")
+                    if not is_calibration(found):
+                        raise ValueError("it is not what a belief was asked")
                     return found
                 except (OSError, ValueError) as error:
                     again = f"python -m experiments.calibrate {self.path}"

@@ -4,7 +4,11 @@ A row is one round of one seed. Fields that a method has no use for are left out
 last gradient step of the round, `policy/` a behaviour's on its last update, `eval/` an evaluation's.
 """
 
-from typing import NamedTuple
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+from jaxplore.validate import FieldError
 
 REWARD = "reward"
 """Stands for the unit of the method's intrinsic reward, which the run's scene names."""
@@ -110,6 +114,32 @@ FIELDS: dict[str, Field] = {
 
 TIMES = ("wall_time", "steps_per_second")
 """Fields that differ between two runs that are the same."""
+
+
+NEEDED = ("coverage", "cells", "wall_time")
+"""Fields that every row has, beside its step and its seed."""
+
+
+def check(row: Mapping[str, Any], num_cells: int) -> None:
+    """Refuse a row that no run writes: one that reports cannot show.
+
+    Args:
+        row: as it was read.
+        num_cells: coverage cells that there are.
+
+    Raises:
+        FieldError: names the field.
+    """
+    for name in NEEDED:
+        if name not in row:
+            raise FieldError(name, None, "a number")
+    for name, value in row.items():
+        # `diverged` is text; what is not finite was written as null.
+        number = isinstance(value, int | float) and math.isfinite(value)
+        if name != "diverged" and not number and (value is not None or name in NEEDED):
+            raise FieldError(name, value, "a finite number" + ("" if name in NEEDED else " or null"))
+    if not isinstance(row["cells"], int) or not 0 <= row["cells"] <= num_cells:
+        raise FieldError("cells", row["cells"], f"a whole number, 0 to {num_cells}")
 
 
 def unit_of(name: str, reward_unit: str | None) -> str:

@@ -77,6 +77,23 @@ def from_json(data: dict[str, Any]) -> Scene:
         plan = data["floor_plan"]
         boxes = plan and {name: tuple(map(tuple, plan[name])) for name in ("walls", "cells")}
         floor_plan = plan and FloorPlan(tuple(plan["position"]), **boxes)
-        return Scene(**{**data, "coverage": Cells(**data["coverage"]), "floor_plan": floor_plan})
-    except (TypeError, KeyError) as error:
+        scene = Scene(**{**data, "coverage": Cells(**data["coverage"]), "floor_plan": floor_plan})
+    except (TypeError, KeyError, AttributeError) as error:
         raise ValueError(f"not a scene: {error!r}") from error
+    _check(scene)
+    return scene
+
+
+def _check(scene: Scene) -> None:
+    """Raise `ValueError` for what pictures and tables cannot be made of."""
+    cells, plan = scene.coverage, scene.floor_plan
+    counts = (cells.num_cells, scene.episode_steps, scene.obs_size, scene.action_size)
+    texts = (cells.unit, scene.variance_unit, *([scene.reward_unit] if scene.reward_unit is not None else []))
+    good = all(type(count) is int and count > 0 for count in counts) and all(isinstance(one, str) for one in texts)
+    good &= cells.reachable is None or (type(cells.reachable) is int and 0 < cells.reachable <= cells.num_cells)
+    if plan is not None:
+        boxes = (*plan.walls, *plan.cells)
+        good &= len(plan.position) == 2 and all(type(at) is int for at in plan.position)
+        good &= all(len(box) == 4 and all(isinstance(edge, int | float) for edge in box) for box in boxes)
+    if not good:
+        raise ValueError("not a scene: it holds values that no environment has")

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from envs.base import Environment
+from envs.errors import EnvironmentFault
 from experiments.runs import console
 from experiments.runs.config import RunConfig
 from experiments.runs.directory import RunDirectory
@@ -53,15 +54,25 @@ def run(
             checkpoint is then whole.
     """
     session = Session(spec, directory, env, agent, programs or make_programs(spec.config, env, agent))
-    session.start(resume=resume)
     try:
-        for first, end in rounds(spec.config, session.step):
-            session.round(first, end)
-    finally:
-        session.close()
+        session.start(resume=resume)
+        try:
+            for first, end in rounds(spec.config, session.step):
+                session.round(first, end)
+        finally:
+            session.close()
+    except EnvironmentFault as fault:
+        raise RunError(
+            f"{fault} That was after step {session.step:,} of the run, whose latest checkpoint is kept. What to do: "
+            "mend the environment, then continue with --resume; --debug shows where it happened."
+        ) from fault
     directory.write_walk(session.state.positions, session.state.episode_steps)
     directory.write_outcome(Status.FINISHED, session.diverged())
     return session.state
+
+
+MOST_LOST = 25
+"""Steps in a row without one that can be learned from after which an environment is given up."""
 
 
 class Session:
@@ -76,7 +87,7 @@ class Session:
     """
 
     state: RunState
-    step: int
+    step: int = 0
     """Environment steps taken."""
 
     def __init__(
@@ -89,6 +100,7 @@ class Session:
         self.evaluate = make_evaluate(spec.config, env, agent, self.programs) if evaluates else None
         self.checkpoints, self.log = directory.checkpoints(), directory.metrics_log()
         self._announced: set[str] = set()
+        self._lost = np.zeros(spec.config.num_seeds, int)
 
     def start(self, *, resume: bool) -> None:
         """Take up the state to continue from, and open what is written to."""
@@ -237,6 +249,10 @@ class Session:
             positions = rows.obs[:, :count][..., list(self.env.floor_plan.position)]
             record.walk(state, positions, record.steps_of_episodes(episode_step, done), span)
         own: list[dict[str, Any]] = [{"dropped": int(count - kept.sum())} for kept in valid]
+        self._lost = np.where(valid.any(axis=1), 0, self._lost + count)
+        if (self._lost[state.alive] >= MOST_LOST).any():
+            what = f"returned numbers that are not finite, or beyond float32, in the last {self._lost.max()} steps"
+            raise EnvironmentFault(self.env.spec.name, "every step", what, "finite observations and rewards")
         if self.env.spec.has_reward:
             for row, ended in zip(own, record.episodes(state, rows.reward[:, :count], done), strict=True):
                 row.update(record.earned(ended))

@@ -225,7 +225,8 @@ def test_a_stepper_knows_where_it_stands_in_an_episode(steppers):
         obs = stepper.obs(env_state)
         assert obs.shape == (SEEDS, 2)
         if at % 7:
-            np.testing.assert_array_equal(obs, rows.next_obs[:, count - 1])
+            # one program may compute it twice, and round otherwise
+            np.testing.assert_allclose(obs, rows.next_obs[:, count - 1], rtol=1e-6)
         else:  # what is seen is the new episode, at rest but for the noise
             assert np.abs(obs - rows.next_obs[:, count - 1]).max() > 0.05
             assert np.abs(obs[:, 1]).max() < 0.05

@@ -6,6 +6,7 @@ from gymnasium import spaces
 
 import envs
 from envs.base import EnvState
+from envs.errors import EnvironmentFault
 from envs.stepper import make_collect, make_collect_all
 
 # Of different shape: bounded torque, choices, MuJoCo, sparse reward, and one of ours with a bit of everything.
@@ -193,8 +194,109 @@ def test_seeds_side_by_side_are_each_alone_and_no_reset_is_a_successor():
 
 def test_an_environment_that_does_not_repeat_itself_is_found_out():
     env = envs.make("gymnasium:jaxplore_test/Forgetful-v0")
-    with pytest.raises(ValueError, match="went elsewhere from the same seed"):
+    with pytest.raises(EnvironmentFault, match=r"went elsewhere from the same seed.*Expected: an environment that"):
         walk(env, env.reset(jax.random.key(0)), actions_for(env, 3))
+
+
+class Faulty(Toy):
+    """Does as told at its third step, or at its reset."""
+
+    how = ""
+
+    def reset(self, *, seed=None, options=None):
+        obs, info = super().reset(seed=seed)
+        self.count = 0
+        if self.how == "reset raises":
+            raise KeyError("lost")
+        if self.how == "three values from reset":
+            return obs, info, None  # pyright: ignore[reportReturnType]
+        return {**obs, "others": obs["others"] * (np.nan if self.how == "reset is nan" else 1.0)}, info
+
+    def step(self, action):
+        found = super().step(action)
+        self.count += 1
+        obs, reward, *rest = found
+        if self.count < 3:
+            return found
+        match self.how:
+            case "raises":
+                raise RuntimeError("the motor\nis on fire")
+            case "four values":
+                return found[:4]
+            case "shape":
+                return ({**obs, "counts": np.zeros(3, np.float32)}, reward, *rest)
+            case "lacks a part":
+                return ({"counts": obs["counts"]}, reward, *rest)
+            case "nan reward":
+                return (obs, np.nan, *rest)
+            case "huge reward":
+                return (obs, 3e38, *rest)
+            case "no reward":
+                return (obs, None, *rest)
+        return found
+
+
+gymnasium.register("jaxplore_test/Faulty-v0", Faulty)
+
+
+@pytest.mark.parametrize("size", [1, 2])
+@pytest.mark.parametrize(
+    ("how", "when", "message"),
+    [
+        ("reset raises", 0, r"raised KeyError: 'lost' at reset\. Expected: an observation and a dictionary\.$"),
+        ("three values from reset", 0, r"returned 3 values at reset\. Expected: an observation and a dictionary\.$"),
+        ("reset is nan", 0, r"returned an observation with numbers that are not finite at reset\."),
+        ("raises", 3, r"raised RuntimeError: the motor at step 3 of an episode\. Expected: an observation, a reward, "),
+        ("four values", 3, r"returned 4 values at step 3 .*Expected: an observation, a reward, terminated, truncated"),
+        ("shape", 3, r"returned an observation counts of shape \(3,\) at step 3 .*Expected: shape \(2,\)"),
+        ("lacks a part", 3, r"returned the observation counts at step 3 .*Expected: a dictionary with counts, others"),
+        ("nan reward", 3, r"returned the reward nan at step 3 .*Expected: a number between -1e\+18 and 1e\+18"),
+        ("huge reward", 3, r"returned the reward 3e\+38 at step 3"),
+        ("no reward", 3, r"returned a reward of type NoneType at step 3 .*Expected: one number"),
+    ],
+)
+def test_what_it_does_wrong_is_said_in_a_line(how, when, message, size, monkeypatch):
+    monkeypatch.setattr(Faulty, "how", how)
+    env = envs.make("gymnasium:jaxplore_test/Faulty-v0")
+    assert env.reset_all is not None and env.step_all is not None
+    keys = jax.random.split(jax.random.key(0), size)
+    if when == 0:
+        with pytest.raises(EnvironmentFault, match=message):
+            env.reset_all(keys)
+        return
+    states = env.reset_all(keys)
+    for _ in range(when - 1):
+        states, _ = env.step_all(states, np.zeros((size, 2), np.float32))
+    with pytest.raises(
+        EnvironmentFault, match="the environment gymnasium:jaxplore_test/Faulty-v0 " + message
+    ) as caught:
+        env.step_all(states, np.zeros((size, 2), np.float32))
+    assert "\n" not in str(caught.value)
+
+
+def test_an_environment_that_cannot_be_made_says_why():
+    class Unmade(Toy):
+        def __init__(self):
+            raise OSError("no such robot")
+
+    gymnasium.registry.pop("jaxplore_test/Unmade-v0", None)
+    gymnasium.register("jaxplore_test/Unmade-v0", Unmade)
+    with pytest.raises(ValueError, match=r"Unmade-v0' cannot be made here: raised OSError: no such robot\. Allowed: "):
+        envs.make("gymnasium:jaxplore_test/Unmade-v0")
+
+
+def test_what_no_float32_can_square_is_no_data():
+    class Exploding(Toy):
+        def _obs(self):
+            obs = super()._obs()
+            return {**obs, "others": obs["others"] + (3e38 if self.ups else 0.0)}
+
+    gymnasium.registry.pop("jaxplore_test/Exploding-v0", None)
+    gymnasium.register("jaxplore_test/Exploding-v0", Exploding)
+    env = envs.make("gymnasium:jaxplore_test/Exploding-v0")
+    _, transition = env.step(env.reset(jax.random.key(0)), np.ones(2))
+    assert transition.terminated
+    assert not np.isfinite(transition.next_obs).all()
 
 
 def test_a_state_that_is_not_finite_ends_the_episode():
@@ -217,9 +319,14 @@ def test_a_state_that_is_not_finite_ends_the_episode():
         (
             "gymnasium:Pendulum-v9",
             {},
-            r"env='gymnasium:Pendulum-v9' is not known\. Did you mean 'gymnasium:Pendulum-v1'",
+            r"env='gymnasium:Pendulum-v9' is not known\. Did you mean 'gymnasium:Pendulum-v1'\? Allowed: .* nearest "
+            r"are (gymnasium:\S+, ){4}gymnasium:\S+\.$",
         ),
-        ("gymnasium:nowhere:Own-v0", {}, "cannot import 'nowhere'"),
+        (
+            "gymnasium:nowhere:Own-v0",
+            {},
+            "needs the module 'nowhere', .* with --import=nowhere, or after `import nowh",
+        ),
         (
             "gymnasim:Pendulum-v1",
             {},
