@@ -141,7 +141,7 @@ def _light(spec: mujoco.MjSpec) -> None:
             type=mujoco.mjtGeom.mjGEOM_BOX,
             pos=((x_min + x_max) / 2, (y_min + y_max) / 2, DRAWN_HEIGHT / 2),
             size=((x_max - x_min) / 2, (y_max - y_min) / 2, DRAWN_HEIGHT / 2),
-            rgba=(0.42, 0.53, 0.70, 1.0),
+            rgba=(0.34, 0.44, 0.60, 1.0),
         )
     for index in range(len(SIDES)):
         spec.geom(f"side_{index}").rgba = (0.0, 0.0, 0.0, 0.0)

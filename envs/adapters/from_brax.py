@@ -11,8 +11,11 @@ from collections.abc import Iterator
 from types import ModuleType
 from typing import Any
 
+import jax
+
 from envs.adapters import brax_like
 from envs.base import Environment
+from envs.errors import raised
 from jaxplore import validate
 from jaxplore.validate import FieldError
 
@@ -59,17 +62,32 @@ def make_environment(
         episode_steps: steps after which an episode is truncated.
 
     Raises:
-        FieldError: an unknown name or backend, observations that are not one vector, or a bad number.
+        FieldError: an unknown name or backend, an environment that Brax itself cannot step, observations that are not
+            one vector, or a bad number.
     """
     check_name(name)
     validate.one_of("backend", backend, ("auto", *BACKENDS))
-    with quiet():
+    with quiet(), jax.numpy_rank_promotion("allow"):
         raw = load().get_environment(name, **({} if backend == "auto" else {"backend": backend}))
         model = getattr(getattr(raw, "sys", None), "mj_model", None)
         own = getattr(raw, "_backend", "jax")
+        _check_runs(raw, name)
         return brax_like.make_environment(
             _Quiet(raw), f"brax:{name}", own, obs_noise, episode_steps, model, lambda state: state.pipeline_state.q
         )
+
+
+def _check_runs(raw: Any, name: str) -> None:
+    """Raise `FieldError` for an environment that Brax itself cannot step here; nothing is computed."""
+
+    def first_step(key: Any) -> Any:
+        return raw.step(raw.reset(key), jax.numpy.zeros(raw.action_size))
+
+    try:
+        jax.eval_shape(first_step, jax.random.key_data(jax.random.key(0)))
+    except Exception as error:  # Old code against a new JAX raises anything.
+        problem = f"cannot be stepped by this version of Brax and JAX: it {raised(error)}"
+        raise FieldError("env", f"brax:{name}", "environments that Brax itself can run here", problem) from error
 
 
 class _Quiet:

@@ -140,6 +140,34 @@ class TestModel:
         assert model.camera("overview").id >= 0
         assert model.camera("track").id >= 0
 
+    @pytest.mark.parametrize("camera", ["track", "overview"])
+    def test_no_wall_hides_the_ant(self, model, host, camera):
+        data, rng = mujoco.MjData(model), np.random.default_rng(0)
+        boxes = [model.site(f"wall_{index}") for index in range(len(WALLS))]
+        low = np.array([box.pos - box.size for box in boxes])
+        high = np.array([box.pos + box.size for box in boxes])
+        np.testing.assert_allclose(np.concatenate([low[:, :2], high[:, :2]], axis=1), WALLS)
+        assert all(model.geom(f"{kind}_{i}").rgba[3] == 0 for kind, n in (("wall", 5), ("side", 4)) for i in range(n))
+        ant = [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] != 0]
+        for cell in range(7):
+            state = host.reset_in(jax.random.key(cell), cell)
+            action = rng.uniform(-1, 1, 8).astype(np.float32)
+            for step in range(60):
+                if step % 5 == 0:
+                    action = rng.uniform(-1, 1, 8).astype(np.float32)
+                state, _ = host.step(state, action)
+                mujoco.mj_setState(model, data, state.physics, host_engine.STATE)
+                mujoco.mj_forward(model, data)
+                eye = data.camera(camera).xpos
+                # Both ends of every capsule; the torso has none.
+                axes = data.geom_xmat[ant].reshape(-1, 3, 3)[:, :, 2] * model.geom_size[ant, 1:2]
+                ends = np.concatenate([data.geom_xpos[ant] + axes, data.geom_xpos[ant] - axes])
+                rays = (ends - eye)[:, None]
+                # Where a line of sight enters and leaves each box, 0 at the eye and 1 at the ant.
+                faces = np.sort(np.stack([(low - eye) / rays, (high - eye) / rays]), axis=0)
+                enter, leave = faces[0].max(axis=-1), faces[1].min(axis=-1)
+                assert not np.any((enter < leave) & (leave > 0) & (enter < 1)), (cell, step)
+
     def test_every_part_of_the_ant_meets_the_floor_and_every_wall(self, model):
         data = mujoco.MjData(model)
         ant = [i for i in range(model.ngeom) if model.geom_bodyid[i] != 0]

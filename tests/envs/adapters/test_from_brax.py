@@ -74,6 +74,32 @@ def test_resets_never_enter_a_transition_and_ends_are_told_apart():
         assert state.num_steps == 8 - length * len(ends)
 
 
+def test_a_state_that_is_changed_in_place_does_not_leak():
+    """Hopper, walker, ant and others change the metrics of the state that they are given, and give them back."""
+    brax = from_brax.load()
+
+    class InPlace(brax.Env):
+        observation_size, action_size, backend = 2, 1, "jax"
+
+        def reset(self, rng):
+            return brax.State(jnp.zeros(()), jnp.zeros(2), jnp.float32(0), jnp.float32(0), {"x": jnp.float32(0)})
+
+        def step(self, state, action):
+            state.metrics.update(x=state.metrics["x"] + action[0])
+            return state.replace(obs=state.obs + state.metrics["x"])
+
+    brax.register_environment("in_place", InPlace)
+    env = envs.make("brax:in_place")
+    state = jax.jit(env.reset)(jax.random.key(0))
+    _, first = env.step(state, jnp.ones(1))
+    _, second = jax.jit(env.step)(state, jnp.ones(1))
+    _, third = env.step(state, jnp.ones(1))
+    assert [float(one.next_obs[0]) for one in (first, second, third)] == [1.0] * 3
+    collect = make_collect(env, 8)
+    _, rows, _ = jax.jit(lambda key, state: collect(key, state, lambda *_: jnp.ones(1), 8))(jax.random.key(0), state)
+    np.testing.assert_array_equal(rows.next_obs[:, 0], np.cumsum(np.arange(1, 9)))
+
+
 @pytest.mark.slow
 def test_what_an_environment_becomes():
     hopper = envs.make("brax:hopper", backend="spring")
@@ -87,6 +113,7 @@ def test_what_an_environment_becomes():
     ("name", "options", "message"),
     [
         ("brax:hoper", {}, r"env='brax:hoper' is not known\. Did you mean 'brax:hopper'\? Allowed: brax:ant"),
+        ("brax:swimmer", {}, r"cannot be stepped by this version of Brax and JAX: it raised TypeError: .*Allowed: env"),
         ("brax:fast", {"backend": "mujoco"}, r"backend='mujoco' is not known\. Allowed: auto, generalized, mjx"),
         ("brax:fast", {"episode_steps": 0}, "episode_steps=0 is out of range"),
         ("brax:fast", {"obs_noise": -1.0}, r"obs_noise=-1\.0 is out of range"),
