@@ -23,7 +23,7 @@ from flax import struct
 
 from jaxplore import validate
 from jaxplore.types import Array, Key, Transition
-from jaxplore.validate import FieldError
+from jaxplore.validate import Checks, FieldError
 
 
 @struct.dataclass
@@ -61,6 +61,18 @@ class EnvSpec:
     """Whether `Transition.reward` is a task's. False: it is always 0, and nothing can be learned from it."""
     obs_limits: tuple[tuple[float, float], ...] | None = None
     """Lowest and highest value of each observation entry, infinite where there is none; None: not known."""
+
+    def __post_init__(self) -> None:
+        checks = Checks(self)
+        for field in ("obs_names", "action_names"):
+            names = getattr(self, field)
+            if isinstance(names, str) or not names or not all(isinstance(name, str) for name in names):
+                raise checks.refusal(field, "names nothing", "one or more names")
+        checks.at_least("episode_steps", 1)
+        checks.in_range("dt", 0.0, open_low=True)
+        if self.obs_limits is not None and len(self.obs_limits) != len(self.obs_names):
+            allowed = f"{len(self.obs_names)} pairs, one for each of obs_names"
+            raise checks.refusal("obs_limits", f"are {len(self.obs_limits)}", allowed)
 
     @property
     def obs_size(self) -> int:

@@ -2,6 +2,10 @@
 # pyright: reportAttributeAccessIssue=false
 # mujoco ships no stubs.
 
+import importlib
+import os
+import subprocess
+import sys
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
@@ -13,9 +17,55 @@ from envs.base import EnvState, View
 SKETCH_DPI = 100
 FREE = "free"
 
+RENDERERS = ("egl", "osmesa", "cgl", "glfw")
+"""MuJoCo's, tried in this order unless `MUJOCO_GL` names one: a GPU, no GPU, a Mac, a screen."""
+
+INSTALL_RENDERER = (
+    "What to do: install a renderer that needs no screen, such as Mesa's (Debian and Ubuntu: apt-get install "
+    "libosmesa6; Fedora: dnf install mesa-libOSMesa; with a GPU: its driver and libegl1), or set MUJOCO_GL to one that "
+    "this machine has: egl, osmesa or glfw."
+)
+
+PROBE = """
+import mujoco
+model = mujoco.MjModel.from_xml_string("<mujoco/>")
+mujoco.Renderer(model, 8, 8).render()
+"""
+
+
+def find_renderer(wanted: str | None = None) -> str:
+    """The first of `RENDERERS` that draws here, or the one that is wanted.
+
+    Raises:
+        RuntimeError: none does; says what to install or to set.
+    """
+    for name in (wanted,) if wanted else RENDERERS:
+        # In a process of its own: a driver may crash, and one that has failed cannot be followed by another.
+        command = [sys.executable, "-c", PROBE]
+        if not subprocess.run(command, env={**os.environ, "MUJOCO_GL": name}, capture_output=True).returncode:
+            return name
+    failed = f"MUJOCO_GL={wanted} does not work here." if wanted else "No renderer works here."
+    raise RuntimeError(f"{failed} {INSTALL_RENDERER}")
+
+
+def use_renderer(wanted: str | None = None) -> None:
+    """Have MuJoCo, which may have been imported already, draw with what `find_renderer` finds, in this process and in
+    those that it starts. Before the first picture: MuJoCo stays with what has drawn one. Raises as `find_renderer`.
+    """
+    import mujoco
+
+    os.environ["MUJOCO_GL"] = find_renderer(wanted)
+    # It reads the variable when it is imported.
+    importlib.reload(sys.modules[mujoco.Renderer.__module__].gl_context)
+
+
+def _has_screen() -> bool:
+    return sys.platform != "linux" or any(os.environ.get(name) for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+
 
 def make_mujoco_view(model: Any, qpos: Callable[[EnvState], Any], cameras: tuple[str, ...]) -> View:
-    """MuJoCo's renderer. It takes an OpenGL library, and `MUJOCO_GL` set before MuJoCo is imported.
+    """MuJoCo's renderer. It takes an OpenGL library: the one that `MUJOCO_GL` names or, where that is not set and there
+    is no screen, the first that works without. Drawing raises `RuntimeError` where none does.
 
     Args:
         model: a `mujoco.MjModel`.
@@ -27,8 +77,10 @@ def make_mujoco_view(model: Any, qpos: Callable[[EnvState], Any], cameras: tuple
     def frames(states: Iterable[EnvState], height: int, width: int, camera: str) -> Iterator[np.ndarray]:
         import mujoco
 
+        if not os.environ.get("MUJOCO_GL") and not _has_screen():
+            use_renderer()
         data = mujoco.MjData(model)
-        with mujoco.Renderer(model, height, width) as renderer:
+        with _open(model, height, width) as renderer:
             for state in states:
                 data.qpos[:] = jax.device_get(qpos(state))
                 mujoco.mj_forward(model, data)
@@ -36,6 +88,20 @@ def make_mujoco_view(model: Any, qpos: Callable[[EnvState], Any], cameras: tuple
                 yield renderer.render()
 
     return View(frames, usual, True)
+
+
+def _open(model: Any, height: int, width: int) -> Any:
+    """MuJoCo's renderer, or one line that says why there is none."""
+    import mujoco
+
+    try:
+        return mujoco.Renderer(model, height, width)
+    except ValueError:  # A picture larger than the model allows.
+        raise
+    except Exception as error:  # Each library raises its own.
+        named = os.environ.get("MUJOCO_GL")
+        failed = f"MUJOCO_GL={named} does not work here" if named else "no renderer works here"
+        raise RuntimeError(f"{failed}: {str(error).splitlines()[0]}. {INSTALL_RENDERER}") from error
 
 
 def light_gymnasium_floor(spec: Any) -> None:

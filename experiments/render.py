@@ -1,133 +1,145 @@
 """`python -m experiments.render RUN`: a video or a picture of a run's agent acting in its environment."""
 
-# MuJoCo loads its GL library when it is imported, and fails to be imported where that one does not work. So what
-# imports MuJoCo is imported late, once a renderer has been found.
+# MuJoCo chooses its GL library when it is imported, and fails to be imported where that one does not work. So what
+# imports MuJoCo is imported late, by `import_mujoco` first.
 # pyright: reportAttributeAccessIssue=false
-# mujoco and imageio ship no stubs.
+# mujoco ships no stubs.
 from __future__ import annotations
 
 import argparse
 import dataclasses
 import os
-import subprocess
 import sys
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from experiments.runs.errors import RunError, disk_error
-from experiments.runs.files import replacing
+from experiments import process
+from experiments.analysis import video
+from experiments.analysis.video import STILLS, SUFFIXES
+from experiments.progress import track
+from experiments.runs.errors import RunError
 
 if TYPE_CHECKING:
-    from envs.base import Environment, EnvState
+    from envs.base import Environment, EnvState, View
     from envs.stepper import Act
     from experiments.runs.config import RunConfig
 
-RENDERERS = ("egl", "osmesa", "cgl", "glfw")
-"""MuJoCo's, tried in this order unless `MUJOCO_GL` names one: a GPU, no GPU, a Mac, a screen."""
 
-SUFFIXES = (".mp4", ".gif", ".png")
-STILLS = 4
-"""Moments in one picture."""
-
-INSTALL_RENDERER = (
-    "What to do: install a renderer that needs no screen, such as Mesa's (Debian and Ubuntu: apt-get install "
-    "libosmesa6; Fedora: dnf install mesa-libOSMesa; with a GPU: its driver and libegl1), or set MUJOCO_GL to one that "
-    "this machine has: egl, osmesa or glfw."
-)
-INSTALL_WRITER = 'A video needs imageio and its ffmpeg. What to do: pip install -e ".[render]".'
-
-PROBE = """
-import mujoco
-model = mujoco.MjModel.from_xml_string("<mujoco/>")
-mujoco.Renderer(model, 8, 8).render()
-"""
+def import_mujoco() -> None:
+    """Import MuJoCo without a renderer, whatever `MUJOCO_GL` says; `use_renderer` comes later."""
+    wanted = os.environ.pop("MUJOCO_GL", None)
+    try:
+        import mujoco  # noqa: F401
+    finally:
+        if wanted is not None:
+            os.environ["MUJOCO_GL"] = wanted
 
 
-def find_renderer() -> str:
-    """The first of `RENDERERS` that draws here, or the one that `MUJOCO_GL` names.
+def use_renderer(view: View) -> None:
+    """Have a view drawn by the renderer that `MUJOCO_GL` names or the first that works here, if it takes one.
 
     Raises:
         RunError: none does; says what to install.
     """
-    wanted = os.environ.get("MUJOCO_GL")
-    for name in (wanted,) if wanted else RENDERERS:
-        # In a process of its own: MuJoCo cannot change its mind, and a driver may crash.
-        command = [sys.executable, "-c", PROBE]
-        if not subprocess.run(command, env={**os.environ, "MUJOCO_GL": name}, capture_output=True).returncode:
-            return name
-    failed = f"MUJOCO_GL={wanted} does not work here." if wanted else "No renderer works here."
-    raise RunError(f"{failed} {INSTALL_RENDERER}")
+    from envs import views
+
+    if view.needs_renderer:
+        try:
+            views.use_renderer(os.environ.get("MUJOCO_GL"))
+        except RuntimeError as error:
+            raise RunError(str(error)) from error
 
 
-def load_actor(run: Path) -> tuple[RunConfig, Environment, Act, int]:
-    """The agent of a run's latest checkpoint.
-
-    Returns:
-        The run's configuration, its environment with physics on the host where it has the choice, an
-        `act(key, obs) -> action`, and the checkpoint's step.
+def config_of(run: Path) -> RunConfig:
+    """The configuration of a run.
 
     Raises:
-        RunError: `run` holds no run or no checkpoint, or its environment cannot be drawn.
+        RunError: `run` holds none.
     """
-    import jax
-
     from experiments.runs.directory import RunDirectory
     from experiments.runs.status import Status
-    from experiments.training import build, loop
 
     directory = RunDirectory(run)
     if directory.status() is Status.ABSENT:
         raise RunError(f"{run} holds no run (no config.json). Give the --out of a run.")
-    config = directory.config()
-    own_env = build.make_env(config)
-    env = build.on_host(config, own_env)
-    _check_view(env, config.env)
-    explorer = build.make_agent(config, own_env)
-    state, step = loop.last_state(directory, own_env, explorer)
-    actor = explorer.actor(jax.tree.map(lambda leaf: leaf[0], state.explorer))
-    act = jax.jit(lambda key, obs: explorer.act(key, actor, obs))
-    return config, env, act, step
+    return directory.config()
 
 
-def load_random(name: str) -> tuple[RunConfig, Environment, Act]:
-    """An environment by its name, and uniform actions.
+def random_config(name: str) -> RunConfig:
+    """Uniform actions in the environment called `name`. Raises `ValueError` where there is no such environment."""
+    from experiments.runs.presets import preset_config
+
+    return dataclasses.replace(preset_config("laptop", name), method="random")
+
+
+def load_env(config: RunConfig, camera: str | None = None) -> tuple[Environment, Environment]:
+    """The environment of a configuration, and the same with its physics on the host where it has the choice.
 
     Raises:
-        ValueError: there is no such environment.
         RunError: it cannot be drawn.
+        ValueError: it cannot be made, or its view has no such camera.
+    """
+    from experiments.training import build
+    from jaxplore import validate
+
+    own_env = build.make_env(config)
+    env = build.on_host(config, own_env)
+    if env.view is None:
+        raise RunError(f"{config.env} has nothing to draw: its environment has no view.")
+    if camera is not None:
+        validate.one_of("--camera", camera, env.view.cameras)
+    return own_env, env
+
+
+def load_actor(run: Path, config: RunConfig, own_env: Environment) -> tuple[Act, int]:
+    """The agent of a run's latest checkpoint: an `act(key, obs) -> action`, and the checkpoint's step.
+
+    Raises:
+        RunError: there is no checkpoint.
     """
     import jax
 
-    from experiments.runs.presets import preset_config
+    from experiments.runs.directory import RunDirectory
+    from experiments.training import build, loop
+
+    explorer = build.make_agent(config, own_env)
+    state, step = loop.last_state(RunDirectory(run), own_env, explorer)
+    actor = explorer.actor(jax.tree.map(lambda leaf: leaf[0], state.explorer))
+    return jax.jit(lambda key, obs: explorer.act(key, actor, obs)), step
+
+
+def load_random(config: RunConfig, own_env: Environment) -> Act:
+    """Uniform actions: an `act(key, obs) -> action`."""
+    import jax
+
     from experiments.training import build
 
-    config = dataclasses.replace(preset_config("laptop", name), method="random")
-    env = build.make_env(config)
-    env = build.on_host(config, env)
-    _check_view(env, name)
-    return config, env, jax.jit(build.make_agent(config, env).act_uniformly)
-
-
-def _check_view(env: Environment, name: str) -> None:
-    if env.view is None:
-        raise RunError(f"{name} has nothing to draw: its environment has no view.")
+    return jax.jit(build.make_agent(config, own_env).act_uniformly)
 
 
 def episode(env: Environment, act: Act, seed: int, num_steps: int) -> list[EnvState]:
-    """The states of `num_steps` of acting, `num_steps + 1` of them, episode after episode."""
+    """The first state of `num_steps` of acting and the one after each step, episode after episode.
+
+    Where an episode ends that is its own last state: the first of the next one is not among them. Physics that diverges
+    stands still for that step.
+    """
     import jax
 
-    from envs.stepper import make_walk
+    from envs.stepper import prepared
 
-    walk = make_walk(env, 1)
+    env = prepared(env)
     key = jax.random.key(seed)
-    states = [env.reset(jax.random.fold_in(key, 0))]
-    for step in range(num_steps):
-        states.append(walk(jax.random.fold_in(key, step + 1), states[-1], act, 1)[0])
+    state = env.reset(jax.random.fold_in(key, 0))
+    states = [state]
+    for step in track("acting", range(num_steps), num_steps):
+        _, act_key, reset_key = jax.random.split(jax.random.fold_in(key, step + 1), 3)
+        state, transition = env.step(state, jax.device_get(act(act_key, state.obs)))
+        states.append(state if np.isfinite(state.obs).all() else states[-1])
+        if transition.terminated or transition.truncated:
+            state = env.reset(reset_key)
     return states
 
 
@@ -137,7 +149,7 @@ def draw(
     """Draw states and write them, whole or not at all.
 
     Args:
-        path: a video in real time (`.mp4`, `.gif`), or one picture (`.png`) of `STILLS` states, evenly spaced.
+        path: a video or a GIF in real time (`.mp4`, `.gif`), or one picture (`.png`) of `STILLS` states, evenly spaced.
         env: whose states they are; it has a view.
         states: what to draw.
         camera: one of the view's; its first by default.
@@ -145,43 +157,17 @@ def draw(
         width: of a frame, pixels.
 
     Raises:
-        RunError: no video writer, or the file cannot be written.
-        ValueError: the view has no such camera, or nothing is known that ends like `path`.
+        RunError: the file cannot be written.
     """
-    try:
-        import imageio.v2 as imageio
-        import imageio_ffmpeg  # noqa: F401
-    except ImportError as error:
-        raise RunError(INSTALL_WRITER) from error
-    from jaxplore import validate
-
     assert env.view is not None
-    camera = camera or env.view.cameras[0]
-    validate.one_of("--camera", camera, env.view.cameras)
-    validate.one_of("the ending of --out", path.suffix, SUFFIXES)
-    try:
-        with replacing(path) as draft:
-            if path.suffix == ".png":
-                places = np.linspace(0, len(states) - 1, min(STILLS, len(states))).round().astype(int)
-                stills = list(env.view.frames([states[i] for i in places], height, width, camera))
-                imageio.imwrite(draft, np.concatenate(stills, axis=1))
-                return
-            options: dict[str, Any] = (
-                {"fps": round(1 / env.spec.dt), "macro_block_size": 2} if path.suffix == ".mp4" else {}
-            )
-            # JAX warns of the fork that starts ffmpeg; nothing but ffmpeg runs in it.
-            with (
-                warnings.catch_warnings(action="ignore", category=RuntimeWarning),
-                imageio.get_writer(draft, **options) as writer,
-            ):
-                for frame in env.view.frames(states, height, width, camera):
-                    writer.append_data(frame)
-    except OSError as error:
-        raise disk_error("write the picture", path, error) from error
+    places, lengths = video.timing(path.suffix, len(states), env.spec.dt)
+    chosen = [states[place] for place in places]
+    frames = env.view.frames(chosen, height, width, camera or env.view.cameras[0])
+    video.write(path, track("drawing", frames, len(chosen)), lengths)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Draw a video; the exit status is 0, 1 with a message, or 2 for bad input."""
+def parse(argv: Sequence[str] | None) -> argparse.Namespace:
+    """What a command line asks for. Raises `SystemExit` for bad input."""
     parser = argparse.ArgumentParser(prog="python -m experiments.render", description=__doc__)
     parser.add_argument("run", type=Path, nargs="?", help="directory of a run")
     parser.add_argument("--env", help="instead of a run: an environment, to see it under uniform actions")
@@ -205,41 +191,52 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"--size={' '.join(map(str, arguments.size))}. Allowed: even numbers from 16 to 1280.")
     if (arguments.run is None) == (arguments.env is None):
         parser.error("give the directory of a run, or --env to see an environment under uniform actions.")
+    if arguments.out is not None and arguments.out.suffix not in SUFFIXES:
+        parser.error(f"--out={arguments.out}. Allowed: a name that ends in {', '.join(SUFFIXES)}.")
+    return arguments
+
+
+def render(arguments: argparse.Namespace) -> str:
+    """What a command line asks for: checks, then acts, then draws; gives the closing line."""
+    run: Path | None = arguments.run
+    config = random_config(arguments.env) if run is None else config_of(run)
+    own_env, env = load_env(config, arguments.camera)
+    assert env.view is not None
+    if run is None:
+        default = Path(arguments.env.replace(":", "-").replace("/", "-") + ".mp4")
+    else:
+        default = run / f"{arguments.camera or env.view.cameras[0]}.mp4"
+    path = arguments.out or default
+    video.check_target(path)
+    use_renderer(env.view)
+
+    from experiments import runtime
+
+    runtime.use_compilation_cache()
+    if run is None:
+        act, after = load_random(config, own_env), ""
+    else:
+        act, step = load_actor(run, config, own_env)
+        after = f" after {step:,} steps"
+    states = episode(env, act, arguments.seed, arguments.steps or env.spec.episode_steps)
+    height, width = arguments.size
+    draw(path, env, states, camera=arguments.camera, height=height, width=width)
+    return f"{config.method} on {config.env}{after}, {len(states) - 1:,} steps of acting: {path}"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Draw a video; the exit status is 0, 1 with a message, or 2 for bad input."""
+    arguments = parse(argv)
+    import_mujoco()
+    from envs.errors import EnvironmentFault
+
     try:
-        # MuJoCo is about to be imported, and takes its renderer then; whether one is needed is known only later.
-        failed = None
-        try:
-            os.environ["MUJOCO_GL"] = find_renderer()
-        except RunError as error:
-            os.environ.pop("MUJOCO_GL", None)
-            failed = error
-
-        from experiments import runtime
-
-        runtime.use_compilation_cache()
-        run: Path | None = arguments.run
-        if run is None:
-            (config, env, act), after = load_random(arguments.env), ""
-        else:
-            config, env, act, step = load_actor(run)
-            after = f" after {step:,} steps"
-        assert env.view is not None
-        if env.view.needs_renderer and failed:
-            raise failed
-        if run is None:
-            default = Path(arguments.env.replace(":", "-").replace("/", "-") + ".mp4")
-        else:
-            default = run / f"{arguments.camera or env.view.cameras[0]}.mp4"
-        path = arguments.out or default
-        states = episode(env, act, arguments.seed, arguments.steps or env.spec.episode_steps)
-        height, width = arguments.size
-        draw(path, env, states, camera=arguments.camera, height=height, width=width)
-    except (RunError, ValueError) as error:
+        print(render(arguments))
+    except (RunError, ValueError, EnvironmentFault) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    print(f"{config.method} on {config.env}{after}, {len(states) - 1:,} steps of acting: {path}")
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    process.carry_out(main)

@@ -100,7 +100,9 @@ def update_normalizers(state: Normalizers, transitions: Transition, valid: Array
 
 def model_inputs(state: Normalizers, obs: Array, action: Array) -> Array:
     """What a network sees: `obs [..., O]`, `action [..., A]` -> `[..., O + A]`, normalised."""
-    return jnp.concatenate([normalizer.normalize(state.obs, obs), normalizer.normalize(state.action, action)], axis=-1)
+    # Actions are within [-1, 1] anyway, and a policy that climbs a gradient needs theirs everywhere.
+    inputs = [normalizer.normalize(state.obs, obs), normalizer.normalize(state.action, action, limit=None)]
+    return jnp.concatenate(inputs, axis=-1)
 
 
 def model_targets(state: Normalizers, obs: Array, next_obs: Array) -> Array:

@@ -4,10 +4,12 @@ from typing import Generic, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from jaxplore import validate
 from jaxplore.types import Array, Key
+from jaxplore.validate import FieldError
 
 Record = TypeVar("Record")
 
@@ -59,8 +61,9 @@ def add(state: Replay[Record], batch: Record, valid: Array | None = None) -> Rep
         The buffer with the rows in it.
 
     Raises:
-        ValueError: `B` over the capacity.
+        ValueError: `B` over the capacity, or a batch whose shapes are not those of the buffer's records.
     """
+    _check_batch(state, batch)
     batch_size, limit = jax.tree.leaves(batch)[0].shape[0], capacity(state)
     if batch_size > limit:
         raise ValueError(f"batch of {batch_size} rows does not fit. Allowed: at most the capacity, {limit}.")
@@ -76,11 +79,30 @@ def add(state: Replay[Record], batch: Record, valid: Array | None = None) -> Rep
     )
 
 
+def _check_batch(state: Replay[Record], batch: Record) -> None:
+    """Raise unless a batch has the structure and the shapes of the buffer's records: others would be broadcast."""
+    there, here = jax.tree.structure(state.rows), jax.tree.structure(batch)
+    if there != here:
+        raise ValueError(f"batch is {here}. Allowed: {there}, as the buffer's records.")
+    leaves = jax.tree.leaves(batch)
+    for rows, new in zip(jax.tree.leaves(state.rows), leaves, strict=True):
+        if jnp.shape(new)[:1] != jnp.shape(leaves[0])[:1] or jnp.shape(new)[1:] != rows.shape[1:] or not jnp.ndim(new):
+            allowed = f"shape [B, {', '.join(map(str, rows.shape[1:]))}], the same B in all".replace(", ]", "]")
+            raise FieldError("batch", jnp.shape(new), allowed, "is the shape of a part")
+
+
 def sample(key: Key, state: Replay[Record], batch_size: int) -> Record:
     """Draw `batch_size` rows `[B, ...]`, independent and uniform over the rows held (with replacement).
 
-    An empty buffer gives its zero rows. `key` is consumed.
+    `key` is consumed.
+
+    Raises:
+        FieldError: `batch_size` below 1, or an empty buffer. Traced, where nobody knows how many rows it holds, an
+            empty one gives its zero rows.
     """
+    validate.at_least("batch_size", batch_size, 1)
+    if validate.known(state.size) and not np.any(state.size):
+        raise FieldError("size", 0, "a buffer with a row in it", "is all that the buffer holds")
     # randint, not choice(replace=False): the latter sorts the whole capacity at each draw.
     index = jax.random.randint(key, (batch_size,), 0, jnp.maximum(state.size, 1))
     return jax.tree.map(lambda rows: rows[index], state.rows)

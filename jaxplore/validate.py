@@ -10,6 +10,8 @@ import math
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+import jax
+
 
 class FieldError(ValueError):
     """A field holds what it may not.
@@ -82,6 +84,11 @@ def at_least(field: str, value: int, low: int) -> None:
     """Raise unless `value` is a whole number of at least `low`."""
     if isinstance(value, bool) or not isinstance(value, int) or value < low:
         raise FieldError(field, value, f"a whole number, {low} or more", "is out of range")
+
+
+def known(value: Any) -> bool:
+    """Whether a value is known here, or only when the program that is being traced runs."""
+    return not isinstance(value, jax.core.Tracer)
 
 
 def widths(field: str, value: tuple[int, ...]) -> None:

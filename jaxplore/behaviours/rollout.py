@@ -1,16 +1,17 @@
 """Rollouts of a policy in sampled models: all m models, all actors, the whole horizon in one program."""
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import jax
 import jax.numpy as jnp
 
-from jaxplore import normalizer
+from jaxplore import normalizer, validate
 from jaxplore.beliefs.base import Belief
 from jaxplore.dynamics import Normalizers
 from jaxplore.signals.base import Score
 from jaxplore.types import Array, Key, Transition
+from jaxplore.validate import FieldError
 
 Mover: TypeAlias = Literal["per_step", "per_rollout", "mean"]
 """Which model moves an actor: a random one at each step (nnaisense/max), one for its whole rollout, or the mean."""
@@ -57,6 +58,9 @@ def rollout(
     Returns:
         Transitions `[H, N, ...]` with the intrinsic reward.
 
+    Raises:
+        FieldError: an unknown `mover`, `horizon` below 1, or a negative `bound`; `start` of another width.
+
     Example:
         >>> import jax, jax.numpy as jnp
         >>> from jaxplore import beliefs, dynamics, rewards
@@ -72,6 +76,11 @@ def rollout(
         (5, 16, 2)
     """
     belief, models, normalizers, score = world
+    validate.one_of("mover", mover, get_args(Mover))
+    validate.at_least("horizon", horizon, 1)
+    validate.in_range("bound", bound, 0.0)
+    if start.ndim != 2 or start.shape[1] != normalizers.obs.mean.shape[-1]:
+        raise FieldError("start", start.shape, f"shape [N, {normalizers.obs.mean.shape[-1]}]", "is its shape")
     member_key, scan_key = jax.random.split(key)
     num_actors = start.shape[0]
     members = jax.random.randint(member_key, (num_actors,), 0, jax.tree.leaves(models)[0].shape[0])
@@ -93,8 +102,8 @@ def rollout(
             delta = jnp.clip(delta, -bound, bound)
         next_obs = belief.encoding.next_obs(normalizers, obs, delta)
         if bound:
-            seen = normalizer.normalize(normalizers.obs, next_obs)
-            next_obs = normalizer.denormalize(normalizers.obs, jnp.clip(seen, -bound, bound))
+            seen = normalizer.normalize(normalizers.obs, next_obs, limit=bound)
+            next_obs = normalizer.denormalize(normalizers.obs, seen)
         never = jnp.zeros(num_actors, bool)
         return next_obs, Transition(obs, action, score(prediction, delta, normalizers), next_obs, never, never)
 

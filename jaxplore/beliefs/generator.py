@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxplore import validate
 from jaxplore.networks import MLP, apply
 from jaxplore.types import Array, Key, Params
 from jaxplore.validate import Checks
@@ -159,7 +160,12 @@ def init(spec: GeneratorSpec, key: Key) -> Params:
 
 
 def sample_noise(spec: GeneratorSpec, key: Key, num: int) -> Array:
-    """Standard normal noise, `[num, Z]` or `[num, layers, Z]`; see `Generator.sample_noise`."""
+    """Standard normal noise, `[num, Z]` or `[num, layers, Z]`; see `Generator.sample_noise`.
+
+    Raises:
+        FieldError: `num` below 1.
+    """
+    validate.at_least("num", num, 1)
     size = spec.config.noise_size
     shape = (num, size) if spec.config.noise == "shared" else (num, len(spec.layers), size)
     return jax.random.normal(key, shape)

@@ -24,12 +24,14 @@ from typing import Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from flax import struct
 
+from jaxplore import validate
 from jaxplore.beliefs.generator import Generator, fan_in
 from jaxplore.types import Array, Key, Metrics, Params
-from jaxplore.validate import Checks
+from jaxplore.validate import Checks, FieldError
 
 Bandwidth = Literal["median", "median_log", "mean", "fixed"]
 Kernel = Literal["rbf", "imq"]
@@ -288,6 +290,18 @@ def further_points(spec: SVGDSpec, key: Key, inputs: Array, extra_inputs: Array 
     return None
 
 
+def _check_batch(spec: SVGDSpec, inputs: Array, targets: Array, extra_inputs: Array | None) -> None:
+    shapes = {"inputs": jnp.shape(inputs), "targets": jnp.shape(targets)}
+    if len(shapes["inputs"]) != 2 or not shapes["inputs"][0]:
+        raise FieldError("inputs", shapes["inputs"], "shape [B, I] with B of 1 or more", "is their shape")
+    wanted = (shapes["inputs"][0], spec.num_outputs)
+    if shapes["targets"] != wanted:
+        raise FieldError("targets", shapes["targets"], f"shape {wanted}", "is their shape")
+    if extra_inputs is not None and jnp.shape(extra_inputs)[1:] != shapes["inputs"][1:]:
+        allowed = f"shape [B, {shapes['inputs'][1]}], as the inputs"
+        raise FieldError("extra_inputs", jnp.shape(extra_inputs), allowed, "is their shape")
+
+
 def update(
     spec: SVGDSpec,
     key: Key,
@@ -310,8 +324,12 @@ def update(
 
     Returns:
         `(state, metrics)`.
+
+    Raises:
+        FieldError: an empty batch, or inputs and targets that do not go together.
     """
     config, generator = spec.config, spec.generator
+    _check_batch(spec, inputs, targets, extra_inputs)
     noise_key, points_key = jax.random.split(key)
     z = state.z if config.redraw == "fixed" else generator.sample_noise(noise_key, config.num_particles)
     batch_size = inputs.shape[0]
@@ -421,7 +439,8 @@ def make_amortized_svgd(
     Example:
         >>> import jax, jax.numpy as jnp, optax
         >>> from jaxplore.networks import MLP
-        >>> from jaxplore.beliefs.generator import make_generator
+        >>> from jaxplore import validate
+    from jaxplore.beliefs.generator import make_generator
         >>> net = MLP(hidden=(16,), output_size=1)
         >>> apply = lambda theta, x: net.apply({"params": theta}, x)
         >>> generator = make_generator(net.init(jax.random.key(0), jnp.zeros(1))["params"])
@@ -442,4 +461,19 @@ def make_amortized_svgd(
             stacklevel=2,
         )
     spec = SVGDSpec(generator, apply, num_outputs, optimizer, config, repulsion_inputs)
-    return AmortizedSVGD(init=partial(init, spec), update=jax.jit(partial(update, spec)))
+    jitted = jax.jit(partial(update, spec))
+
+    def checked_update(
+        key: Key,
+        state: SVGDState,
+        inputs: Array,
+        targets: Array,
+        num_data: int | Array,
+        extra_inputs: Array | None = None,
+    ) -> tuple[SVGDState, Metrics]:
+        # Here, where it may still be known: within the program it is not.
+        if validate.known(num_data) and not np.all(np.asarray(num_data) > 0):
+            raise FieldError("num_data", num_data, "1 or more, the data that the batch is a part of", "is out of range")
+        return jitted(key, state, inputs, targets, num_data, extra_inputs)
+
+    return AmortizedSVGD(init=partial(init, spec), update=checked_update)

@@ -9,11 +9,22 @@ import math
 import jax
 import jax.numpy as jnp
 
+from jaxplore import validate
 from jaxplore.dynamics import LOG_VAR_BOUNDS, Prediction
 from jaxplore.types import Array
+from jaxplore.validate import FieldError
 
 MIN_VAR, MAX_VAR = math.exp(LOG_VAR_BOUNDS[0]), math.exp(LOG_VAR_BOUNDS[1])
 """Smallest and largest variance that a Gaussian network states, per squared unit of normalised delta."""
+
+
+def _check(prediction: Prediction) -> None:
+    """Raise unless a prediction is of one model or more."""
+    mean, var = jnp.shape(prediction.mean), prediction.var
+    if len(mean) != 3 or not mean[0]:
+        raise FieldError("prediction.mean", mean, "shape [M, N, O] with M of 1 or more", "is its shape")
+    if var is not None and jnp.shape(var) != mean:
+        raise FieldError("prediction.var", jnp.shape(var), f"shape {mean}, as the mean", "is its shape")
 
 
 def variance(prediction: Prediction, delta_std: Array | None = None) -> Array:
@@ -29,11 +40,15 @@ def variance(prediction: Prediction, delta_std: Array | None = None) -> Array:
     Returns:
         `[N]`, at least 0.
 
+    Raises:
+        FieldError: a prediction of another shape.
+
     Example:
         >>> import jax.numpy as jnp
         >>> float(variance(Prediction(jnp.array([[[0.0, 0.0]], [[2.0, 2.0]]])))[0])
         2.0
     """
+    _check(prediction)
     spread = jnp.var(prediction.mean, axis=0)
     if delta_std is not None:
         spread = spread * delta_std[None, :] ** 2
@@ -59,12 +74,18 @@ def jensen_renyi(prediction: Prediction, decay: float = 0.1) -> Array:
         `[N]`, at most ln m. At least 0 where all models state the same variance; Renyi's entropy of order 2 is not
         concave, so where variances differ and means do not it falls a little below.
 
+    Raises:
+        FieldError: `decay` outside of (0, 1].
+
     Example:
         >>> import jax.numpy as jnp
         >>> apart = Prediction(jnp.array([[[0.0]], [[100.0]]]))
         >>> round(float(jensen_renyi(apart)[0]), 4)  # ln 2
         0.6931
     """
+    _check(prediction)
+    if validate.known(decay):
+        validate.in_range("decay", float(decay), 0.0, 1.0, open_low=True)
     # Entries first: sums over them then run over whole rows of models and transitions.
     mean = jnp.moveaxis(prediction.mean, -1, 0)
     stated = jnp.full_like(mean, MIN_VAR) if prediction.var is None else jnp.moveaxis(prediction.var, -1, 0)

@@ -44,3 +44,20 @@ def test_backends_of_an_environment_that_does_not_mind_are_its_own(monkeypatch):
     chain = envs.make("nchain")
     monkeypatch.setitem(envs.FACTORIES, "easy_going", lambda backend="auto": chain)
     assert envs.backends("easy_going") == ("jax",)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"dt": 0.0}, r"EnvSpec\.dt=0\.0 is out of range\. Allowed: a finite number in \(0, inf\)"),
+        ({"episode_steps": 0}, r"EnvSpec\.episode_steps=0 is out of range"),
+        ({"obs_names": ()}, r"EnvSpec\.obs_names=\(\) names nothing\. Allowed: one or more names"),
+        ({"action_names": "push"}, r"EnvSpec\.action_names='push' names nothing"),
+        ({"obs_limits": ((0.0, 1.0),)}, r"EnvSpec\.obs_limits=.* are 1\. Allowed: 2 pairs"),
+    ],
+)
+def test_a_spec_that_no_environment_has_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        envs.EnvSpec(
+            **{"name": "x", "obs_names": ("a", "b"), "action_names": ("c",), "episode_steps": 3, "dt": 0.1, **changes}
+        )

@@ -84,3 +84,43 @@ def test_dynamics_units():
     np.testing.assert_allclose(inputs, np.hstack([standard(obs), standard(action)]), rtol=1e-3, atol=1e-5)
     np.testing.assert_allclose(targets, standard(next_obs - obs), rtol=1e-3, atol=1e-5)
     np.testing.assert_allclose(applied, next_obs, rtol=1e-4, atol=1e-5)
+
+
+def test_an_entry_that_stood_still_is_not_a_million_times_as_far_as_the_rest():
+    # Humanoid-v5's contact forces: 0 for long, then hundreds. Beyond the statistics everything is 10 away, within them
+    # nothing changes
+    still = np.tile(np.array([0.0, 100.0, 1e5, 0.3], np.float32), (500, 1))
+    state = update(normalizer.init(4), still + np.array([0, 0, 0, 1.0]) * RNG.normal(size=(500, 1)).astype(np.float32))
+    np.testing.assert_allclose(state.std[:3], [1e-3, 1e-3, 1.0], rtol=1e-3)
+    rows = np.array([[400.0, 104.0, 1e5 + 3.0, 0.5], [0.0, 100.0, 1e5, 5.0]], np.float32)
+    seen = np.asarray(normalize(state, rows))
+    np.testing.assert_allclose(seen[0, :3], [10.0, 10.0, 3.0], rtol=1e-2)
+    np.testing.assert_allclose(seen[1, :3], 0.0, atol=0.02)
+    free = np.asarray(normalizer.normalize(state, rows, limit=None))
+    assert free[0, 0] == pytest.approx(4e5, rel=1e-2)
+    np.testing.assert_array_equal(seen[:, 3], free[:, 3])
+    np.testing.assert_allclose(denormalize(state, free), rows, rtol=1e-4)
+
+
+def test_a_belief_sees_and_aims_at_what_is_within_the_limit():
+    # the action is as it is: within [-1, 1] anyway
+    state = dynamics.init_normalizers(2, 1)
+    obs, action = jnp.array([[50.0, -0.5]]), jnp.array([[40.0]])
+    np.testing.assert_array_equal(dynamics.model_inputs(state, obs, action), [[10.0, -0.5, 40.0]])
+    np.testing.assert_array_equal(dynamics.model_targets(state, obs, obs + 30.0), [[10.0, 10.0]])
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda state: normalizer.update(state, jnp.zeros((5, 1))), r"rows=\(5, 1\) is their shape\. .*\[B, 3\]"),
+        (lambda state: normalizer.update(state, jnp.zeros(3)), r"rows=\(3,\) is their shape\. Allowed: .*\[B, 3\]"),
+        (lambda state: normalizer.update(state, jnp.zeros((5, 3)), jnp.ones(1)), r"weights=\(1,\) .*shape \(5,\)"),
+        (lambda state: normalizer.normalize(state, jnp.zeros((5, 1))), r"rows=\(5, 1\) .*\[\.\.\., 3\]"),
+        (lambda state: normalizer.denormalize(state, jnp.zeros(())), r"rows=\(\) .*\[\.\.\., 3\]"),
+        (lambda state: normalizer.init(0), r"size=0 is out of range"),
+    ],
+)
+def test_rows_of_another_width_are_refused(call, message):
+    with pytest.raises(ValueError, match=message):
+        call(normalizer.init(3))

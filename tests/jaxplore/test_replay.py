@@ -75,12 +75,31 @@ def test_draws_are_independent():
     assert distinct == pytest.approx(6 / 27, abs=0.04)
 
 
-def test_empty_buffer_gives_zero_rows():
+def test_an_empty_buffer_is_refused_where_it_is_known_and_gives_zero_rows_where_not():
     # as its docstring says; dtypes are those of the example
     state = replay.init({"x": jnp.ones((2,), jnp.int32), "flag": jnp.ones((), bool)}, CAPACITY)
-    drawn = replay.sample(jax.random.key(0), state, 3)
+    with pytest.raises(ValueError, match=r"size=0 is all that the buffer holds\. Allowed: a buffer with a row in it"):
+        replay.sample(jax.random.key(0), state, 3)
+    drawn = jax.jit(replay.sample, static_argnums=2)(jax.random.key(0), state, 3)
     np.testing.assert_array_equal(drawn["x"], np.zeros((3, 2), np.int32))
     assert drawn["x"].dtype == jnp.int32 and drawn["flag"].dtype == bool
+
+
+@pytest.mark.parametrize(
+    ("batch", "message"),
+    [
+        ({"x": jnp.zeros((5, 1)), "y": jnp.zeros(5)}, r"batch=\(5, 1\) is the shape of a part\. Allowed: .*\[B, 3\]"),
+        ({"x": jnp.zeros(3), "y": jnp.zeros(())}, r"batch=\(3,\) is the shape"),
+        ({"x": jnp.zeros((5, 3)), "y": jnp.zeros(1)}, r"batch=\(1,\) .*Allowed: shape \[B\], the same B in all"),
+        ({"x": jnp.zeros((5, 3))}, r"batch is PyTreeDef\(.*Allowed: PyTreeDef"),
+    ],
+)
+def test_records_of_another_shape_are_refused(batch, message):
+    # rows of width 1 would be broadcast
+    state = replay.init({"x": jnp.zeros(3), "y": jnp.zeros(())}, CAPACITY)
+    for add in (replay.add, jax.jit(replay.add)):
+        with pytest.raises(ValueError, match=message):
+            add(state, batch)
 
 
 def test_bad_sizes_are_refused():

@@ -153,7 +153,8 @@ def test_reward_sees_all_models_and_the_delta_that_happened(mover):
 
 def test_bound_holds_changes_and_observations_near_the_data():
     # models 100 times as strong, from the data's mean: each normalised change is clipped to +-2 (by hand at the first
-    # step), observations stop at 2 standard deviations of theirs; without a bound they pass 1e6
+    # step), observations stop at 2 standard deviations of theirs; without a bound they are soon hundreds away, and no
+    # more: what the models see of that is within 10
     start = np.tile(MEANS["obs"].astype(np.float32), (N, 1)) + START / 10
     rows = imagine(bound=2.0, models=100 * MODELS, start=start, horizon=30)
     seen = (rows.next_obs - MEANS["obs"]) / STDS["obs"]
@@ -163,7 +164,21 @@ def test_bound_holds_changes_and_observations_near_the_data():
     for n in range(N):
         assert np.min(np.max(np.abs(clipped[n] - change[n]), axis=1)) < 1e-4
     assert np.max(np.abs(change)) == pytest.approx(2.0, rel=1e-4)
-    assert np.max(np.abs(imagine(models=100 * MODELS).next_obs)) > 1e6
+    assert 500 < np.max(np.abs(imagine(models=100 * MODELS).next_obs)) < 5000
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mover": "per_stp"}, r"mover='per_stp' is not known\. Did you mean 'per_step'\? Allowed: mean, per_r"),
+        ({"horizon": 0}, r"horizon=0 is out of range"),
+        ({"bound": -1.0}, r"bound=-1\.0 is out of range"),
+        ({"start": START[:, :1]}, r"start=\(\d+, 1\) is its shape\. Allowed: shape \[N, \d+\]"),
+    ],
+)
+def test_refusals(changes, message):
+    with pytest.raises(ValueError, match=message):
+        imagine(**changes)
 
 
 def test_a_wide_bound_changes_nothing():

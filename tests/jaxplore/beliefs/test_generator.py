@@ -193,3 +193,6 @@ def test_bad_input_is_refused():
         GeneratorConfig(hidden=())
     with pytest.raises(ValueError, match=r"GeneratorConfig\.noise_size=0"):
         GeneratorConfig(noise_size=0)
+    generator = make_generator({"a": {"kernel": jnp.ones((2, 3))}}, GeneratorConfig(hidden=(4,), noise_size=2))
+    with pytest.raises(ValueError, match="num=0 is out of range"):
+        generator.sample_noise(jax.random.key(0), 0)

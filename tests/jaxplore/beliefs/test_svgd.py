@@ -10,7 +10,7 @@ import optax
 import pytest
 
 from jaxplore.beliefs import svgd
-from jaxplore.beliefs.generator import Generator
+from jaxplore.beliefs.generator import Generator, GeneratorConfig, make_generator
 from jaxplore.beliefs.svgd import MIN_BANDWIDTH, SVGDConfig, bandwidth, make_amortized_svgd, squared_distances
 
 stein_direction = jax.jit(svgd.stein_direction, static_argnames="config")
@@ -420,3 +420,29 @@ def test_bandwidth_has_a_floor_in_float32(rule):
     direction = stein_direction(jnp.zeros_like(values), values, SVGDConfig(bandwidth=rule))
     assert direction.bandwidth == pytest.approx(MIN_BANDWIDTH)
     assert direction.kernel_mean == pytest.approx(1 - 1e-4, abs=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"num_data": 0}, r"num_data=0 is out of range\. Allowed: 1 or more"),
+        (
+            {"inputs": np.zeros((0, 2)), "targets": np.zeros((0, 1))},
+            r"inputs=\(0, 2\) is their .*B of 1 or more",
+        ),
+        ({"targets": np.zeros((5, 2))}, r"targets=\(5, 2\) is their shape\. Allowed: shape \(5, 1\)"),
+        ({"targets": np.zeros((1, 1))}, r"targets=\(1, 1\) is their shape\. Allowed: shape \(5, 1\)"),
+    ],
+)
+def test_data_that_do_not_go_together_are_refused(changes, message):
+    example = {"dense": {"kernel": np.ones((2, 1), np.float32)}}
+    posterior = make_amortized_svgd(
+        make_generator(example, GeneratorConfig(hidden=(4,), noise_size=2)),
+        lambda params, x: x @ params["dense"]["kernel"],
+        1,
+        optax.adam(1e-3),
+        SVGDConfig(num_particles=2),
+    )
+    given = {"inputs": np.zeros((5, 2)), "targets": np.zeros((5, 1)), "num_data": 5, **changes}
+    with pytest.raises(ValueError, match=message):
+        posterior.update(jax.random.key(0), posterior.init(jax.random.key(1)), **given)

@@ -173,3 +173,21 @@ def test_trajectory_spread_is_over_actors():
     want = np.sum(np.std(delta.astype(float), axis=0, ddof=1))
     np.testing.assert_allclose(trajectory_spread(delta), np.full(5, want), rtol=1e-5)
     np.testing.assert_array_equal(trajectory_spread(np.ones((1, 3), np.float32)), [0.0])
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: rewards.jensen_renyi(Prediction(jnp.zeros((2, 3, 4))), decay=2), r"decay=2\.0 is out of range"),
+        (lambda: rewards.jensen_renyi(Prediction(jnp.zeros((2, 3, 4))), decay=0.0), r"decay=0\.0 is out of range"),
+        (lambda: rewards.variance(Prediction(jnp.zeros((3, 4)))), r"prediction\.mean=\(3, 4\) is its shape"),
+        (lambda: rewards.variance(Prediction(jnp.zeros((0, 3, 4)))), r"with M of 1 or more"),
+        (
+            lambda: rewards.jensen_renyi(Prediction(jnp.zeros((2, 3, 4)), jnp.zeros((2, 3, 1)))),
+            r"prediction\.var=\(2, 3, 1\) is its shape\. Allowed: shape \(2, 3, 4\)",
+        ),
+    ],
+)
+def test_refusals(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
