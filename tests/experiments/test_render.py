@@ -1,14 +1,20 @@
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
+from PIL import Image
 
+from envs import views
 from experiments import render
+from experiments.analysis import video
 from experiments.runs.errors import RunError
-from tests.experiments.tiny import ROOT
+from tests.experiments.tiny import ROOT, make_point
 
 
 def command(*words: object, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -25,8 +31,8 @@ def command(*words: object, **environment: str) -> subprocess.CompletedProcess[s
 @pytest.fixture(scope="module")
 def renderer() -> str:
     try:
-        return render.find_renderer()
-    except RunError as error:
+        return views.find_renderer()
+    except RuntimeError as error:
         pytest.skip(f"no video can be drawn on this machine: {error}")
 
 
@@ -61,24 +67,38 @@ def test_a_renderer_that_does_not_work_is_said_with_what_to_install(finished):
         assert len(done.stderr.splitlines()) == 1
 
 
-def test_without_any_renderer_all_are_tried(monkeypatch: pytest.MonkeyPatch):
-    tried = []
-
-    def fail(command, env, **_):
-        tried.append(env["MUJOCO_GL"])
-        return subprocess.CompletedProcess(command, 1)
-
-    monkeypatch.delenv("MUJOCO_GL", raising=False)
-    monkeypatch.setattr(subprocess, "run", fail)
-    with pytest.raises(RunError, match=r"No renderer works here\. What to do: install a renderer.*libosmesa6"):
-        render.find_renderer()
-    assert tried == list(render.RENDERERS)
-
-
-def test_without_imageio_it_is_named(finished, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_without_imageio_it_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(RunError, match=r'pip install -e "\.\[render\]"'):
-        render.draw(tmp_path / "a.mp4", None, [], camera="track", height=16, width=16)  # type: ignore[arg-type]
+        video.check_target(tmp_path / "a.mp4")
+
+
+def test_what_cannot_be_written_is_said_before_anything_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    for name in ("load_random", "use_renderer", "episode"):
+        monkeypatch.setattr(render, name, lambda *_: pytest.fail("it has begun"))
+    (tmp_path / "taken.png").mkdir()
+    (tmp_path / "file").write_text("")
+    said = []
+    for name in ("none/a.gif", "taken.png", "file/a.mp4"):
+        assert render.main(["--env=acrobot", f"--out={tmp_path / name}"]) == 1
+        said.append(capsys.readouterr().err)
+    assert said[0].startswith(f"error: cannot write the picture {tmp_path}/none/a.gif: {tmp_path}/none is no directory")
+    assert said[1].startswith(f"error: cannot write the picture {tmp_path}/taken.png: a directory has that name")
+    assert said[2].startswith(f"error: cannot write the picture {tmp_path}/file/a.mp4: {tmp_path}/file is no directory")
+    assert render.main(["--env=acrobot", "--camera=top", f"--out={tmp_path}/a.gif"]) == 1
+    assert capsys.readouterr().err == "error: --camera='top' is not known. Allowed: sketch.\n"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "taken.png"]
+
+
+def test_a_disk_that_refuses_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def refuse(**_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", refuse)
+    with pytest.raises(RunError, match=r"a\.mp4: Permission denied\. What to do: make it writable"):
+        video.check_target(tmp_path / "a.mp4")
 
 
 def test_what_holds_no_run_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -89,18 +109,20 @@ def test_what_holds_no_run_is_said(tmp_path: Path, capsys: pytest.CaptureFixture
 
 def test_a_run_without_a_checkpoint_is_said(finished, tmp_path: Path):
     (tmp_path / "config.json").write_bytes((finished.out / "config.json").read_bytes())
+    config = render.config_of(tmp_path)
     with pytest.raises(RunError, match="has no checkpoint yet: let it run for 20 steps"):
-        render.load_actor(tmp_path)
+        render.load_actor(tmp_path, config, render.load_env(config)[0])
 
 
-def test_an_environment_without_looks_is_said(point: str, tmp_path: Path):
-    (tmp_path / "config.json").write_text('{"env": "point"}')
+def test_an_environment_without_looks_is_said(point: str):
     with pytest.raises(RunError, match="point has nothing to draw"):
-        render.load_actor(tmp_path)
+        render.load_env(render.random_config(point))
 
 
 def test_the_agent_acts_as_it_was_saved(finished):
-    config, env, act, step = render.load_actor(finished.out)
+    config = render.config_of(finished.out)
+    own_env, env = render.load_env(config)
+    act, step = render.load_actor(finished.out, config, own_env)
     assert (config.env, env.compiled, step) == ("ant_maze", False, 81)
 
     def observed(seed: int) -> np.ndarray:
@@ -111,6 +133,97 @@ def test_the_agent_acts_as_it_was_saved(finished):
     assert not np.array_equal(observed(1), observed(2))
 
 
+def test_the_last_state_is_of_the_episode_that_ends():
+    states = render.episode(make_point(), lambda key, obs: np.ones(2, np.float32), 0, num_steps=42)
+    assert [int(state.num_steps) for state in states] == [*range(21), *range(1, 21), 1, 2]
+    # Pushed one way all the time: it is never further than at an episode's end.
+    x = np.array([state.obs[0] for state in states])
+    assert x.argmax() in (20, 40) and x[20] > x[19] and x[40] > x[39]
+
+
+def test_physics_that_diverges_stands_still():
+    env = make_point()
+
+    def push(key: jax.Array, obs: np.ndarray) -> np.ndarray:
+        return np.full(2, np.nan if push.calls.pop(0) else 1.0, np.float32)
+
+    push.calls = [False, True, False]
+    states = render.episode(env, push, 0, num_steps=3)
+    assert len(states) == 4
+    assert states[2] is states[1]
+
+
+@pytest.mark.parametrize(
+    ("suffix", "num", "dt", "places", "lengths"),
+    [
+        (".mp4", 3, 0.05, [0, 1, 2], [0.05] * 3),
+        (".gif", 3, 0.05, [0, 1, 2], [0.05] * 3),
+        (".gif", 3, 1 / 30, [0, 1, 2], [0.03, 0.04, 0.03]),
+        (".gif", 4, 1 / 100, [1, 3], [0.02, 0.02]),
+        (".gif", 1, 1 / 100, [0], [0.02]),
+        (".png", 301, 0.05, [0, 100, 200, 300], [0.05] * 4),
+        (".png", 2, 0.05, [0, 1], [0.05] * 2),
+    ],
+)
+def test_when_what_is_shown(suffix: str, num: int, dt: float, places: list[int], lengths: list[float]):
+    timing = video.timing(suffix, num, dt)
+    assert list(timing.places) == places
+    np.testing.assert_allclose(timing.lengths, lengths)
+
+
+@pytest.mark.parametrize("dt", [1 / 125, 1 / 60, 1 / 30, 0.05, 0.2, 1.0])
+def test_gifs_play_in_real_time(dt: float):
+    timing = video.timing(".gif", 301, dt)
+    assert timing.places[-1] == 300
+    assert min(timing.lengths) >= 0.02
+    starts = np.cumsum([0.0, *timing.lengths[:-1]]) + dt * timing.places[0]
+    np.testing.assert_allclose(starts, dt * np.array(timing.places), atol=0.0101)
+
+
+def test_a_gif_repeats_forever(tmp_path: Path):
+    frames = [np.full((16, 16, 3), shade, np.uint8) for shade in (0, 100, 200)]
+    video.write(tmp_path / "a.gif", iter(frames), [0.03, 0.04, 0.2])
+    with Image.open(tmp_path / "a.gif") as image:
+        assert (image.n_frames, image.info["loop"]) == (3, 0)
+        shown = []
+        for frame in range(3):
+            image.seek(frame)
+            shown.append((image.info["duration"], image.convert("L").getpixel((8, 8))))
+    assert shown == [(30, 0), (40, 100), (200, 200)]
+
+
+def test_stills_stand_side_by_side(tmp_path: Path):
+    frames = [np.full((16, 20, 3), shade, np.uint8) for shade in (0, 100, 200)]
+    video.write(tmp_path / "a.png", iter(frames), [0.05] * 3)
+    with Image.open(tmp_path / "a.png") as image:
+        assert image.size == (60, 16)
+        assert [image.getpixel((x, 8)) for x in (0, 30, 59)] == [(0, 0, 0), (100, 100, 100), (200, 200, 200)]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals to a group of processes")
+def test_ctrl_c_gives_a_line_and_leaves_nothing(tmp_path: Path):
+    words = ("--env=acrobot", "--steps=1000", "--size", "480", "640", f"--out={tmp_path}/a.mp4")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "experiments.render", *words],
+        cwd=ROOT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 120
+    while not any(path.stat().st_size for path in tmp_path.iterdir()):
+        assert process.poll() is None and time.monotonic() < deadline
+        time.sleep(0.1)
+    # As a terminal does it: also to ffmpeg.
+    os.killpg(process.pid, signal.SIGINT)
+    stdout, stderr = process.communicate(timeout=60)
+    assert (process.returncode, stdout) == (130, "")
+    assert stderr.strip().splitlines()[-1] == "Stopped."
+    assert "Traceback" not in stderr and "error" not in stderr
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -118,6 +231,7 @@ def test_the_agent_acts_as_it_was_saved(finished):
         (("--seed=-1",), "--seed=-1. Allowed: 0 or more"),
         (("--size", "4000", "640"), "--size=4000 640. Allowed: even numbers from 16 to 1280"),
         (("--env=ant_maze",), "give the directory of a run, or --env"),
+        (("--out=a.avi",), "--out=a.avi. Allowed: a name that ends in .mp4, .gif, .png"),
     ],
 )
 def test_bad_flags_are_refused(words: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str]):
