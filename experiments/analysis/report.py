@@ -1,5 +1,6 @@
 """What a finished run leaves to look at: pictures and a table, made from its files alone."""
 
+import functools
 import os
 import shlex
 import statistics
@@ -80,7 +81,7 @@ def summary(rows: Sequence[Row], cells: Cells, files: Mapping[str, str | os.Path
         raise ValueError("rows: a run without rows has no summary")
     seeds = sorted({row["seed"] for row in rows})
     own = [[row for row in rows if row["seed"] == seed] for seed in seeds]
-    columns = [column for column in _columns(cells) if any(column[2](one) is not None for one in own)]
+    columns = _columns(cells, rows)
     values = [[find(one) for _, _, find in columns] for one in own]
     lines = [
         (str(seed), *("-" if v is None else f(v) for v, (_, f, _) in zip(line, columns, strict=True)))
@@ -89,8 +90,9 @@ def summary(rows: Sequence[Row], cells: Cells, files: Mapping[str, str | os.Path
     if len(seeds) > 1:
         known = [[v for v in column if v is not None] for column in zip(*values, strict=True)]
         write = [f for _, f, _ in columns]
-        lines.append(("median", *(f(statistics.median(v)) for f, v in zip(write, known, strict=True))))
-        lines.append(("range", *(span(f(min(v)), f(max(v))) for f, v in zip(write, known, strict=True))))
+        pairs = list(zip(write, known, strict=True))
+        lines.append(("median", *(f(statistics.median(v)) if v else "-" for f, v in pairs)))
+        lines.append(("range", *(span(f(min(v)), f(max(v))) if v else "-" for f, v in pairs)))
     text = text_table(("seed", *(head for head, _, _ in columns)), lines).split("\n")
     if len(seeds) > 1:
         text[-2:-2] = [text[1]]
@@ -105,13 +107,17 @@ def summary(rows: Sequence[Row], cells: Cells, files: Mapping[str, str | os.Path
     return "\n".join(text)
 
 
-def _columns(cells: Cells) -> list[Column]:
-    """The columns of the closing table; those that no seed has a number for are left out."""
+def _columns(cells: Cells, rows: Sequence[Row]) -> list[Column]:
+    """The columns of the closing table; returns only where there are any."""
+    returns = (("last return", "episode_return"), ("eval return", "eval/return"))
     return [
         (f"{cells.unit} (of {cells.size})", lambda n: f"{n:g}", lambda rows: max(row["cells"] for row in rows)),
         ("last new at step", lambda n: f"{n:,.0f}", _last_new),
-        ("last return", number, lambda rows: _last(rows, "episode_return")),
-        ("eval return", number, lambda rows: _last(rows, "eval/return")),
+        *(
+            (head, number, functools.partial(_last, field=field))
+            for head, field in returns
+            if _last(rows, field) is not None
+        ),
         ("steps", lambda n: f"{n:,.0f}", lambda rows: rows[-1]["step"]),
         ("time", duration, lambda rows: rows[-1]["wall_time"]),
         ("steps/s", lambda n: f"{n:.1f}", lambda rows: rows[-1]["step"] / max(rows[-1]["wall_time"], 1e-9)),
@@ -122,7 +128,7 @@ def _last(rows: Sequence[Row], field: str) -> float | None:
     return next((row[field] for row in reversed(rows) if row.get(field) is not None), None)
 
 
-def _last_new(rows: Sequence[Row]) -> int:
-    """The step (end of its round) at which the last new cell was seen."""
+def _last_new(rows: Sequence[Row]) -> int | None:
+    """The step (end of its round) at which the last new cell was seen; None: none was."""
     most = max(row["cells"] for row in rows)
-    return next(row["step"] for row in rows if row["cells"] == most)
+    return next(row["step"] for row in rows if row["cells"] == most) if most else None

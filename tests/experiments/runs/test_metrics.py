@@ -315,6 +315,19 @@ def test_summary_of_several_seeds():
     assert spread.split()[:4] == ["range", "4", "to", "6"]
 
 
+def test_where_nothing_was_found_there_is_no_last_new_step():
+    rows = [row | {"cells": row["cells"] * (row["seed"] == 2)} for step in (100, 200) for row in make_rows(step, 3)]
+    head, _, *seeds, _, median, spread = summary(rows, Cells(2, "horizontal poses")).splitlines()
+    assert "last new at step" in head
+    assert [line.split()[:3] for line in seeds] == [["0", "0", "-"], ["1", "0", "-"], ["2", "3", "100"]]
+    assert median.split()[:3] == ["median", "0", "100"]
+    rows = [row for row in rows if row["seed"] < 2]
+    *_, one, _, median, spread = summary(rows, Cells(2, "horizontal poses")).splitlines()
+    assert one.split()[:3] == ["1", "0", "-"]
+    assert median.split()[:3] == ["median", "0", "-"]
+    assert spread.split()[:3] == ["range", "0", "-"]
+
+
 def test_summary_of_nothing():
     with pytest.raises(ValueError, match="rows"):
         summary([], Cells(7, "cells"))
