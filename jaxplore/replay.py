@@ -101,7 +101,7 @@ def sample(key: Key, state: Replay[Record], batch_size: int) -> Record:
             empty one gives its zero rows.
     """
     validate.at_least("batch_size", batch_size, 1)
-    if validate.known(state.size) and not np.any(state.size):
+    if validate.known(state.size) and not np.any(np.asarray(state.size)):
         raise FieldError("size", 0, "a buffer with a row in it", "is all that the buffer holds")
     # randint, not choice(replace=False): the latter sorts the whole capacity at each draw.
     index = jax.random.randint(key, (batch_size,), 0, jnp.maximum(state.size, 1))

@@ -9,6 +9,7 @@ import dataclasses
 import difflib
 import functools
 import inspect
+import re
 import textwrap
 import typing
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -20,6 +21,9 @@ try:
     import tyro
 except ImportError as error:
     raise RunError('the command line needs tyro. What to do: pip install -e ".[experiments]".') from error
+
+NUMBERS: dict[Any, tuple[str, str]] = {int: ("INT", "a whole number"), float: ("FLOAT", "a number")}
+"""What stands for a number in the help, and what is allowed."""
 
 WIDTH = 100
 """Columns of the brief help."""
@@ -86,9 +90,12 @@ def parse(
         The values of each of `groups`, as nested dictionaries.
 
     Raises:
-        ValueError: a flag that does not exist, naming the nearest.
-        SystemExit: with 0 after `--help`, with 2 for a value of the wrong type.
+        ValueError: a flag that does not exist, naming the nearest; a flag without its value, or with one that it does
+            not take; text where a number belongs.
+        SystemExit: with 0 after `--help`.
     """
+    kinds = {flag: kind for group in groups for flag, kind in _flags(group, layout.unprefixed)}
+    _check_words(argv, kinds)
     names = [f"group_{i}" for i in range(len(groups))]
     mirrors = [_mirror(group, layout, top=True) for group in groups]
     fields = [(name, _group(mirror), mirror()) for name, mirror in zip(names, mirrors, strict=True)]
@@ -98,11 +105,38 @@ def parse(
         name = word.partition("=")[0].replace("_", "-")
         if name in layout.moved:
             raise ValueError(f"{word} is no setting any more. Allowed: {layout.moved[name]}.")
-        known = [flag for group in groups for flag in _flags(group, layout.unprefixed)]
-        nearest = difflib.get_close_matches(name, known, n=1)
+        nearest = difflib.get_close_matches(name, kinds, n=1)
         hint = f" Did you mean {nearest[0]}?" if nearest else ""
         raise ValueError(f"{word} is not known.{hint} Allowed: what {prog} --help lists.")
-    return [dataclasses.asdict(getattr(parsed, name)) for name in names]
+    return [_values(group, getattr(parsed, name), layout) for group, name in zip(groups, names, strict=True)]
+
+
+def _values(config: Any, parsed: Any, layout: Layout, prefix: str = "--") -> dict[str, Any]:
+    """The values of a mirror of `config`, in the types of its fields.
+
+    Raises:
+        ValueError: text where a number belongs; names the flag.
+    """
+    found, hints = {}, typing.get_type_hints(type(config))
+    for item in dataclasses.fields(config):
+        value, text = getattr(config, item.name), getattr(parsed, item.name)
+        name = f"{prefix}{item.name.replace('_', '-')}"
+        if dataclasses.is_dataclass(value):
+            found[item.name] = _values(value, text, layout, prefix if item.name in layout.unprefixed else f"{name}.")
+        elif hints[item.name] in NUMBERS:
+            found[item.name] = _number(name, text, hints[item.name])
+        elif hints[item.name] == tuple[int, ...]:
+            found[item.name] = tuple(_number(name, one, int) for one in text)
+        else:
+            found[item.name] = text
+    return found
+
+
+def _number(name: str, text: str, kind: Any) -> Any:
+    try:
+        return kind(text)
+    except ValueError:
+        raise ValueError(f"{name}={text!r} is not a number. Allowed: {NUMBERS[kind][1]}.") from None
 
 
 def brief(groups: Sequence[Any], prog: str, description: str, layout: Layout, notes: str = "") -> str:
@@ -134,14 +168,30 @@ def brief(groups: Sequence[Any], prog: str, description: str, layout: Layout, no
     return "\n".join([*lines, "", *textwrap.wrap(notes, WIDTH, subsequent_indent="  ")] if notes else lines)
 
 
-def _flags(config: Any, unprefixed: Sequence[str], prefix: str = "--") -> Iterator[str]:
-    """The flags of a dataclass's fields."""
+def _check_words(argv: Sequence[str], kinds: Mapping[str, Any]) -> None:
+    """Refuse in one line what tyro draws a box about, or takes apart."""
+    for word, after in zip(argv, [*argv[1:], "--"], strict=True):
+        flag, equals, value = word.partition("=")
+        flag = flag.replace("_", "-")
+        switch = re.sub(r"(^--|\.)no-", r"\1", flag)
+        if equals and kinds.get(switch) is bool:
+            negative = re.sub(r"\.([^.]*)$", r".no-\1", switch)
+            allowed = switch if negative == switch else f"{switch} or {negative}"
+            raise ValueError(f"{flag}={value!r} takes no value. Allowed: {allowed}.")
+        takes_one = flag in kinds and kinds[flag] is not bool and get_origin(kinds[flag]) is not tuple
+        if takes_one and not equals and after.startswith("--"):
+            raise ValueError(f"{flag} lacks its value. Allowed: {flag}=VALUE.")
+
+
+def _flags(config: Any, unprefixed: Sequence[str], prefix: str = "--") -> Iterator[tuple[str, Any]]:
+    """The flags of a dataclass's fields, and their types."""
+    hints = typing.get_type_hints(type(config))
     for item in dataclasses.fields(config):
         value, name = getattr(config, item.name), item.name.replace("_", "-")
         if dataclasses.is_dataclass(value):
             yield from _flags(value, unprefixed, prefix if item.name in unprefixed else f"{prefix}{name}.")
         else:
-            yield f"{prefix}{name}"
+            yield f"{prefix}{name}", hints[item.name]
 
 
 def _group(mirror: type) -> Any:
@@ -171,6 +221,11 @@ def _mirror(config: Any, layout: Layout, *, top: bool = False) -> type:
         if hint == str | None:
             hint, value = str, value or ""
             settings |= {"metavar": "PATH", "help_behavior_hint": ""}
+        elif hint in NUMBERS:
+            # As text, too: `parse` refuses it in one line, where tyro draws a box.
+            settings["metavar"], hint, value = NUMBERS[hint][0], str, str(value)
+        elif hint == tuple[int, ...]:
+            settings["metavar"], hint, value = "INT [INT ...]", tuple[str, ...], tuple(map(str, value))
         elif hint is bool and top:
             # Nobody asks for --no-version; a setting has both, whatever its default.
             hint = tyro.conf.FlagCreatePairsOff[bool]

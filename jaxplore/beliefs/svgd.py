@@ -439,8 +439,7 @@ def make_amortized_svgd(
     Example:
         >>> import jax, jax.numpy as jnp, optax
         >>> from jaxplore.networks import MLP
-        >>> from jaxplore import validate
-    from jaxplore.beliefs.generator import make_generator
+        >>> from jaxplore.beliefs.generator import make_generator
         >>> net = MLP(hidden=(16,), output_size=1)
         >>> apply = lambda theta, x: net.apply({"params": theta}, x)
         >>> generator = make_generator(net.init(jax.random.key(0), jnp.zeros(1))["params"])

@@ -158,10 +158,13 @@ def begin(explorer, num=20, seed=0, **kwargs):
 
 
 def normal(state, rows):
-    """`(normalised obs, normalised change)` of rows in raw units, by NumPy from the explorer's statistics."""
+    """`(normalised obs, normalised change)` of rows in raw units, by NumPy from the explorer's statistics; the first as
+    models see it, within 10."""
     scale = lambda stats, x: (np.asarray(x) - np.asarray(stats.mean)) / np.asarray(stats.std)  # noqa: E731
     stats = state.normalizers
-    return scale(stats.obs, rows.obs), scale(stats.delta, np.asarray(rows.next_obs) - np.asarray(rows.obs))
+    return np.clip(scale(stats.obs, rows.obs), -10, 10), scale(
+        stats.delta, np.asarray(rows.next_obs) - np.asarray(rows.obs)
+    )
 
 
 def held(buffer):

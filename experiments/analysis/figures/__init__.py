@@ -4,8 +4,9 @@ from experiments.analysis.figures.style import save  # First: it says what to in
 
 # isort: split
 from experiments.analysis.figures.calibration import Reliability, plot_calibration
-from experiments.analysis.figures.curves import FEW_CELLS, Curves, plot_coverage, plot_intrinsic_reward
+from experiments.analysis.figures.curves import FEW_CELLS, plot_coverage, plot_intrinsic_reward
 from experiments.analysis.figures.floor import plot_visitation
+from experiments.analysis.figures.panels import Curves
 
 __all__ = [
     "FEW_CELLS",
