@@ -1,12 +1,12 @@
 """The networks: a plain MLP, value heads and the tanh-Gaussian policy. The only file that knows linen and distrax.
 
-Every network is unbatched-friendly: leading axes of the input pass through.
+distrax, with the probability library behind it, takes as long to import as JAX itself, so it is imported when the first
+action is drawn. Every network is unbatched-friendly: leading axes of the input pass through.
 """
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import distrax
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -131,6 +131,10 @@ def sample_tanh_gaussian(key: Key, params: GaussianParams) -> tuple[Array, Array
         >>> action.shape, log_prob.shape
         ((2,), ())
     """
+    # The first call may be traced, and what a module makes at its import must not be.
+    with jax.ensure_compile_time_eval(), jax.numpy_rank_promotion("allow"):
+        import distrax
+
     gaussian = distrax.MultivariateNormalDiag(params.mean, jnp.exp(params.log_std))
     squashed = distrax.Transformed(gaussian, distrax.Block(distrax.Tanh(), 1))
     # distrax adds its sample axis by rank promotion; callers may have forbidden that.

@@ -2,6 +2,8 @@
 
 import ast
 import pathlib
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -85,6 +87,24 @@ def test_a_belief_is_trained_sampled_and_imagined_in_by_exported_names():
     assert metrics["imagined_reward"] > 0 and metrics["invalid_imagined"] == 0
     assert any(np.any(a != b) for a, b in zip(jax.tree.leaves(untrained), jax.tree.leaves(trained), strict=True))
     assert action.shape == (NUM, 2) and np.max(np.abs(action)) <= 1
+
+
+LATE = """
+import sys, jaxplore as jx
+late = {"distrax", "tensorflow_probability"}
+assert not late & set(sys.modules)
+import jax, jax.numpy as jnp
+from jaxplore.networks import GaussianParams, sample_tanh_gaussian
+for num in (1, 2):
+    jax.eval_shape(sample_tanh_gaussian, jax.random.key(0), GaussianParams(jnp.zeros(num), jnp.zeros(num)))
+assert late <= set(sys.modules)
+"""
+
+
+def test_the_probability_library_comes_with_the_first_action():
+    # it takes as long to import as JAX; and its import, in the middle of a trace, leaves nothing of the trace behind
+    done = subprocess.run([sys.executable, "-c", LATE], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_only_exported_names_are_used():
