@@ -52,8 +52,9 @@ def plot_calibration(
     """
     colours = dict(zip((group.label for group in groups), COLOURS, strict=False))
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(10.4, 4.3), layout="constrained")
-        left, right = figure.subplots(1, 2, width_ratios=(1.15, 1))
+        figure = Figure(figsize=(10.4, 4.8), layout="constrained")
+        halves = figure.subfigures(1, 2, width_ratios=(1.15, 1))
+        left, right = (half.subplots() for half in halves)
         ends = []
         for group in groups:
             parts = max(1, min(10, len(group.variance) // fewest))
@@ -71,7 +72,6 @@ def plot_calibration(
         left.set_xlabel(f"variance of the models ({unit})")
         left.set_ylabel("squared error of their mean")
         left.set_title("predicted against true, by tenths", loc="left")
-        left.legend(frameon=False, fontsize=9)
         if cells:
             _cells_panel(right, cells)
         else:
@@ -80,7 +80,12 @@ def plot_calibration(
                 right.plot(np.sort(group.variance), shares, color=colours[group.label], linewidth=2, label=group.label)
             right.set(xscale="log", xlabel=f"variance of the models ({unit})", ylabel="share of transitions below")
             right.set_title("how variance is spread", loc="left")
-        for axes in (left, right):
+        rows = -(-len(groups) // 2)
+        for half, axes in zip(halves, (left, right), strict=True):
+            # Below, where they cover nothing, and as high on either side.
+            handles, labels = axes.get_legend_handles_labels()
+            columns = -(-len(labels) // rows)
+            half.legend(handles, labels, loc="outside lower center", frameon=False, fontsize=9, ncols=columns)
             axes.grid(color="#e4e4e4", linewidth=0.7)
             axes.set_axisbelow(True)
         if title:
@@ -103,4 +108,3 @@ def _cells_panel(axes: Axes, cells: Sequence[dict[str, Any]]) -> None:
     axes.xaxis.set_major_locator(FixedLocator(at.tolist()))
     axes.set_xlabel("cell (shaded: never seen)")
     axes.set_title("uniform actions in each cell, medians", loc="left")
-    axes.legend(frameon=False, fontsize=9)

@@ -8,7 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocator, NullFormatter, PercentFormatter
 
-from experiments.analysis.figures.panels import MOST_BELOW, Curves, draw_lines, finish, name_of, panels_of
+from experiments.analysis.figures import panels as layout
+from experiments.analysis.figures.panels import Curves, draw_lines, finish, name_of, panels_of
 from experiments.analysis.figures.style import SOFT, STYLE
 from experiments.runs.scene import Cells
 
@@ -136,7 +137,8 @@ def _scale(axes: Axes, drawn: np.ndarray) -> None:
         axes.text(0.5, 0.5, "this method has no intrinsic reward", ha="center", color=SOFT, transform=axes.transAxes)
     elif len(positive) and np.quantile(positive, 0.98) > 30 * np.quantile(positive, 0.02):
         axes.set_yscale("log", nonpositive="mask")
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        # Over many decades, only they are named.
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if positive.max() < 1e4 * positive.min() else (1,)))
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axes.yaxis.set_minor_formatter(NullFormatter())
     else:
@@ -159,7 +161,8 @@ def _window(group: Curves) -> int:
 
 def _smoothed(group: Curves, curves: Sequence[Curves]) -> str:
     window = _window(group)
-    return f" (bold: mean of {window} rounds)" if window > 1 and len(curves) <= MOST_BELOW else ""
+    many = layout.MOST_BELOW < len(curves) <= layout.MOST_IN_PICTURE
+    return f" (bold: mean of {window} rounds)" if window > 1 and not many else ""
 
 
 def _median(values: np.ndarray) -> np.ndarray:

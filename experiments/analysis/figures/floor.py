@@ -11,6 +11,7 @@ from matplotlib.collections import PatchCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
 
 from envs.base import FloorPlan
 from experiments.analysis.figures.style import STYLE, save
@@ -30,8 +31,8 @@ def plot_visitation(
     *,
     title: str | None = None,
 ) -> None:
-    """Draws the floor from above at equal parts of a run: everywhere it has been so far, early in an episode blue, late
-    red.
+    """Draws the floor from above, in metres, at equal parts of a run: everywhere it has been so far, early in an
+    episode blue, late red.
 
     Args:
         path: of the PNG to write.
@@ -64,7 +65,7 @@ def plot_visitation(
     with matplotlib.rc_context(STYLE):
         width = 2.75  # Of a panel, inches.
         height = max(1.5, width * (top - bottom) / (right - left))  # The colour bar has a label.
-        figure = Figure(figsize=(width * panels + 0.9, height + 0.4 + (0.22 if title else 0)), layout="compressed")
+        figure = Figure(figsize=(width * panels + 1.3, height + 0.7 + (0.22 if title else 0)), layout="compressed")
         row = figure.subplots(1, panels, squeeze=False)[0]
         for panel, (axes, cells) in enumerate(zip(row, cells_seen, strict=True), 1):
             until = total * panel // panels
@@ -74,10 +75,14 @@ def plot_visitation(
             shown = order[order < until]
             dots = {"s": 3.0, "alpha": 0.8, "linewidths": 0, "zorder": 3}
             axes.scatter(*positions[shown].T, c=episode_steps[shown], cmap=_AGE, norm=ages, **dots)
-            axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xticks=[], yticks=[])
+            axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="x (m)")
+            for axis in (axes.xaxis, axes.yaxis):
+                axis.set_major_locator(MaxNLocator(4, integer=True))
+            axes.tick_params(length=2, labelleft=axes is row[0])
             axes.spines[:].set_visible(False)
             axes.set_title(f"{until:,} steps", loc="left", fontweight="bold")
             axes.set_title(f"{cells} of {coverage.num_cells} {coverage.unit}", loc="right", fontsize=9.5)
+        row[0].set_ylabel("y (m)")
         bar = figure.colorbar(ScalarMappable(ages, _AGE), ax=row, fraction=0.03, pad=0.012, aspect=24)
         bar.set_label("step of the episode")
         bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from experiments.analysis.figures.style import COLOURS, INK, save
+from experiments.analysis.figures.style import COLOURS, save
 
 
 class Curves(NamedTuple):
@@ -41,6 +41,7 @@ MOST_IN_PICTURE = 8
 MOST_BELOW = 4
 """More groups than these are named to the right of the axes, not below."""
 OTHERS = "#c8c8c8"
+STEPS = "environment steps"
 
 
 def panels_of(curves: Sequence[Curves]) -> tuple[Figure, list[Panel]]:
@@ -49,7 +50,8 @@ def panels_of(curves: Sequence[Curves]) -> tuple[Figure, list[Panel]]:
     if count <= MOST_IN_PICTURE:
         figure = Figure(figsize=(6.6, 4.1), layout="constrained")
         return figure, [Panel(figure.subplots(), curves, ())]
-    columns = 3 if count <= 9 else 4 if count <= 24 else 6
+    # Few empty places, and then rather more rows.
+    columns = 3 if count <= 9 else min((4, 5), key=lambda columns: -count % columns)
     rows = -(-count // columns)
     figure = Figure(figsize=(2.4 * columns + 0.6, 1.75 * rows + 0.9), layout="constrained")
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
@@ -58,6 +60,7 @@ def panels_of(curves: Sequence[Curves]) -> tuple[Figure, list[Panel]]:
     # The lowest of each column has the numbers; where the last row is not full that is one further up.
     for axes in grid.flat[max(0, count - columns) : count]:
         axes.xaxis.set_tick_params(labelbottom=True)
+        axes.set_xlabel(STEPS, fontsize=9)
     panels = []
     for i, (axes, group) in enumerate(zip(grid.flat, curves, strict=False)):
         axes.set_title(f"{group.label}, n = {len(group.values)}", loc="left", fontsize=9.5)
@@ -90,8 +93,10 @@ def draw_lines(
 
 
 def name_of(group: Curves, curves: Sequence[Curves]) -> str:
-    """What a group is called; short where there are many, as the legend's title says the rest."""
+    """What a group is called in the legend; short where there are many, as its title, or the panel's, says the rest."""
     count = len(group.values)
+    if len(curves) > MOST_IN_PICTURE:
+        return "median"
     if len(curves) > MOST_BELOW:
         return f"{group.label}, {count}"
     return f"{group.label}, {'median of ' if count > 1 else ''}n = {count}"
@@ -120,12 +125,11 @@ def finish(
         axes.xaxis.set_major_formatter(FuncFormatter(lambda step, _: f"{step:,.0f}"))
     first = panels[0].axes
     if one:
-        first.set_xlabel("environment steps")
+        first.set_xlabel(STEPS)
         first.set_ylabel(quantity)
         if title:
             first.set_title(title, loc="left")
     else:
-        figure.supxlabel("environment steps", fontsize=10)
         figure.supylabel(quantity, fontsize=10)
         if title:
             figure.suptitle(title, x=0.01, ha="left")
@@ -136,17 +140,12 @@ def finish(
 def _add_legend(figure: Figure, axes: Axes, curves: Sequence[Curves]) -> None:
     handles, labels = axes.get_legend_handles_labels()
     if len(curves) > MOST_IN_PICTURE:
-        # What has a name in the first panel beside its own group, such as a limit, is in all of them.
-        named = dict(zip(labels, handles, strict=True))
-        named = {label: handle for label, handle in named.items() if not label.startswith(curves[0].label)}
-        colour = COLOURS[0]
-        handles = [
-            Line2D([], [], color=colour, linewidth=2.4, label="median"),
-            Line2D([], [], color=colour, linewidth=0.8, alpha=0.45, label="each seed"),
+        # The first panel has the names of all.
+        handles += [
+            Line2D([], [], color=COLOURS[0], linewidth=0.8, alpha=0.45, label="each seed"),
             Line2D([], [], color=OTHERS, linewidth=0.8, label="medians of the others"),
-            *named.values(),
         ]
-        figure.legend(handles=handles, loc="outside lower right", frameon=False, ncols=len(handles), labelcolor=INK)
+        figure.legend(handles=handles, loc="outside lower right", frameon=False, ncols=len(handles))
     elif len(curves) > MOST_BELOW:
         figure.set_figwidth(figure.get_figwidth() * 1.3)
         title = "median, of so many seeds"
