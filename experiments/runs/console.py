@@ -20,6 +20,7 @@ class Progress:
         total_steps: environment steps of the whole run, each seed's.
         start_step: steps already done, of a run that is resumed.
         num_cells: how many cells there are; coverage is then shown as a count.
+        warm_up: steps of random actions at the start; what is left after them cannot be told from them.
         stream: where to write, stderr by default.
         live: whether to draw a bar; by default, whether `stream` is a terminal.
     """
@@ -30,11 +31,12 @@ class Progress:
         *,
         start_step: int = 0,
         num_cells: int | None = None,
+        warm_up: int = 0,
         stream: TextIO | None = None,
         live: bool | None = None,
     ) -> None:
         self._stream = stream or sys.stderr
-        self._total, self._step, self._num_cells = total_steps, start_step, num_cells
+        self._total, self._step, self._num_cells, self._warm_up = total_steps, start_step, num_cells, warm_up
         # Speed is that of the last rounds, since learning began: before that they are quicker, and then comes the
         # time it takes to compile.
         self._recent, self._learning = deque([(time.monotonic(), start_step)], maxlen=20), False
@@ -50,7 +52,7 @@ class Progress:
 
     def update(self, step: int, rows: Sequence[Row]) -> None:
         """Shows a round: `step` environment steps are done, `rows` are the round's (one per seed)."""
-        if not self._learning and (_values(rows, "intrinsic_reward") or any("/" in n for row in rows for n in row)):
+        if not self._learning and step > self._warm_up:
             self._recent.clear()
             self._learning = True
         self._recent.append((time.monotonic(), step))
@@ -59,7 +61,7 @@ class Progress:
         text = _seen(rows, self._num_cells)
         if rate > 0:
             text += f"{rate:.{0 if rate >= 9.95 else 1}f} steps/s"
-        if rate > 0 and step < self._total:
+        if rate > 0 and self._learning and step < self._total:
             left = (self._total - step) / rate
             text += f"  {duration(left) if left < 60 or left >= 3600 else f'{left / 60:.0f} min'} left"
         done, tenth = step - self._step, 10 * step // self._total > 10 * self._step // self._total

@@ -32,7 +32,7 @@ from experiments.runs.asked import is_calibration
 from experiments.runs.checkpoint import Checkpoints
 from experiments.runs.config import RunConfig
 from experiments.runs.errors import RunError, disk_error
-from experiments.runs.files import read_json, read_text, replacing, write_text
+from experiments.runs.files import read_json, read_text, replacing, sweep, write_text
 from experiments.runs.metrics import MetricsLog, read_metrics
 from experiments.runs.scene import Scene
 from experiments.runs.spec import RunSpec
@@ -211,6 +211,7 @@ class RunDirectory:
         }
         try:
             self.path.mkdir(parents=True, exist_ok=True)
+            sweep(self.path)
             for name, text in texts.items():
                 if not (self.path / name).exists():
                     write_text(self.path / name, text)

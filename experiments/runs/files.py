@@ -3,6 +3,7 @@
 import contextlib
 import json
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,27 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
         with contextlib.suppress(OSError):
             draft.unlink()
         raise
+
+
+def sweep(directory: Path) -> None:
+    """Remove the drafts in a directory whose processes have ended: killed while they wrote."""
+    for draft in directory.glob("*.tmp*"):
+        process = re.search(r"\.tmp(\d+)", draft.name)
+        if process and not _lives(int(process[1])):
+            with contextlib.suppress(OSError):
+                draft.unlink()
+
+
+def _lives(process: int) -> bool:
+    if os.name == "nt":
+        return True  # There `os.kill` kills, whatever the signal.
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
 
 
 def write_text(path: Path, text: str) -> None:

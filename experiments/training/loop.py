@@ -124,7 +124,12 @@ class Session:
         last = self.step if restored is not None else -1
         self.log.truncate_after(last)
         self.board = self.directory.tensorboard_log(self.config.num_seeds, last if resume else None)
-        self.progress = console.Progress(self.config.steps, start_step=self.step, num_cells=self.env.coverage.num_cells)
+        self.progress = console.Progress(
+            self.config.steps,
+            start_step=self.step,
+            num_cells=self.env.coverage.num_cells,
+            warm_up=self.config.explorer.warm_up_steps,
+        )
         if resume:
             known = f"Continuing from step {self.step:,}" if restored else "There is no checkpoint yet: starting over"
             self.progress.say(known)

@@ -2,7 +2,10 @@
 
 import dataclasses
 import json
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -72,6 +75,17 @@ def test_a_scene_comes_back_as_it_was():
     assert scene.from_json(json.loads(scene.to_json(SCENE))) == SCENE
     with pytest.raises(ValueError, match="not a scene"):
         scene.from_json({})
+
+
+def test_drafts_of_processes_that_have_ended_are_swept_and_others_stay(tmp_path: Path):
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        ended.wait()
+    names = [f"coverage.tmp{ended.pid}.png", f"walk.tmp{os.getpid()}.npz", "mine.tmp", "coverage.png"]
+    for name in names:
+        (tmp_path / name).write_text("")
+    begun(tmp_path)
+    there = {path.name for path in tmp_path.iterdir()}
+    assert there & set(names) == set(names[1:])
 
 
 # Specifications.
