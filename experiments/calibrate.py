@@ -6,6 +6,7 @@ the models' disagreement (equation 1 of Ratzlaff et al. 2020) is held against th
 """
 
 import argparse
+import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,15 +14,18 @@ from typing import Any
 
 import numpy as np
 
-from experiments import runtime
+from envs.base import Environment, EnvState
+from experiments import process, runtime
 from experiments.analysis import figures
 from experiments.analysis.calibration import FEWEST, Judged, record
 from experiments.analysis.load import scene_of
 from experiments.analysis.tables import number, text_table
+from experiments.progress import Progress
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
 from experiments.training import build, loop
-from experiments.training.ask import ask
+from experiments.training.ask import NEW_STEPS, STARTS, STEPS_EACH, ask
+from jaxplore.types import Key, Transition
 
 
 def write(run: Path, until: int | None = None) -> str:
@@ -40,7 +44,14 @@ def write(run: Path, until: int | None = None) -> str:
     explorer = build.make_agent(config, own_env)
     state, step = loop.last_state(directory, own_env, explorer, until)
     env, unit = build.on_host(config, own_env), scene_of(directory).variance_unit
-    judged = [ask(config, env, explorer, state, index) for index in range(config.num_seeds)]
+    judged, each = [], num_steps(env)
+    progress = Progress("asking", config.num_seeds * each)
+    try:
+        for index in range(config.num_seeds):
+            judged.append(ask(config, watched(env, progress, index * each), explorer, state, index))
+            progress.reach((index + 1) * each)
+    finally:
+        progress.close()
     seeds = [{"seed": config.seed + index, **record(own, env.coverage.num_cells)} for index, own in enumerate(judged)]
     title = f"{config.method} on {config.env} after {step:,} steps"
     found = {"method": config.method, "env": config.env, "step": step, "unit": unit, "seeds": seeds}
@@ -62,6 +73,43 @@ def write(run: Path, until: int | None = None) -> str:
     return "\n".join(
         [title, f"unit: {unit}", "", _table(seeds, judged), "", *told_apart, f"written to {file}, {picture}"]
     )
+
+
+def num_steps(env: Environment) -> int:
+    """How many steps `ask` takes in `env` for one seed, at most."""
+    cells = min(env.coverage.num_cells, STARTS)
+    return NEW_STEPS + (STARTS // cells * cells * STEPS_EACH if env.reset_in else 0)
+
+
+def watched(env: Environment, progress: Progress, before: int) -> Environment:
+    """The same environment, whose steps `progress` is told of, after `before` earlier ones; of a compiled one it is the
+    starts, as its steps are inside of a program.
+    """
+    done = before
+
+    def tell(more: int) -> None:
+        nonlocal done
+        done += more
+        progress.reach(done)
+
+    def step(state: EnvState, action: Any) -> tuple[EnvState, Transition]:
+        tell(1)
+        return env.step(state, action)
+
+    def step_all(states: tuple[EnvState, ...], actions: np.ndarray) -> tuple[tuple[EnvState, ...], Transition]:
+        assert env.step_all is not None
+        tell(len(states))
+        return env.step_all(states, actions)
+
+    def reset_in(key: Key, cell: int) -> EnvState:
+        assert env.reset_in is not None
+        tell(STEPS_EACH if env.compiled else 0)
+        return env.reset_in(key, cell)
+
+    changes: dict[str, Any] = {"reset_in": env.reset_in and reset_in}
+    if not env.compiled:
+        changes |= {"step": step, "step_all": env.step_all and step_all}
+    return dataclasses.replace(env, **changes)
 
 
 def _table(seeds: Sequence[Mapping[str, Any]], judged: Sequence[dict[str, Judged]]) -> str:
@@ -92,4 +140,4 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    process.carry_out(main)

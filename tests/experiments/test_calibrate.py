@@ -1,7 +1,12 @@
 """What a belief knows and whether it knows that: known answers for the figures, and the command on a finished run."""
 
+import io
 import json
+import os
 import shutil
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
@@ -12,13 +17,13 @@ import pytest
 import envs
 from experiments import calibrate
 from experiments.analysis.calibration import DATA, FEWEST, HELD_OUT, SEEN, UNSEEN, Judged, calibration, told_apart
-from experiments.training.ask import CHUNK, STEPS_EACH, Judge, walk_elsewhere
+from experiments.training.ask import CHUNK, STEPS_EACH, Judge, walk, walk_elsewhere
 from jaxplore import dynamics
 from jaxplore.behaviours import uniform_actions
 from jaxplore.beliefs import Belief, make_no_belief
 from jaxplore.dynamics import Prediction
 from jaxplore.types import Transition
-from tests.experiments.tiny import make_point
+from tests.experiments.tiny import ROOT, make_point
 
 
 def judged(variance, error, stated=0.0):
@@ -144,6 +149,72 @@ def test_an_earlier_checkpoint_can_be_asked(asked: Path, tmp_path: Path, capsys:
     assert (text["step"], text["seeds"][0]["sets"][DATA]["num"]) == (75, 75)
     assert calibrate.main([str(out), "--until=74"]) == 1
     assert "no checkpoint up to step 74, only of [75, 81]" in capsys.readouterr().err
+
+
+class Told:
+    """A `Progress` that keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.done: list[int] = []
+
+    def reach(self, done: int) -> None:
+        self.done.append(done)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "steps", "seen"),
+    [
+        # On the host every step is seen; of a compiled one, that it begins anew.
+        ("ant_maze", {"backend": "mujoco"}, 600 + 7 * 20 * STEPS_EACH, 600 + 7 * 20 * STEPS_EACH),
+        ("mountain_car", {}, 600 + 100 * STEPS_EACH, 100 * STEPS_EACH),
+    ],
+)
+def test_how_far_it_is(name: str, options: dict, steps: int, seen: int):
+    env = envs.make(name, **options)
+    assert calibrate.num_steps(env) == steps
+    told = Told()
+    watched = calibrate.watched(env, told, 5_000)  # type: ignore[arg-type]
+
+    def act(key, obs):
+        return uniform_actions(key, obs, env.spec.action_size)
+
+    rows = walk(watched, jax.random.key(0), act, 600)
+    again = walk(env, jax.random.key(0), act, 600)
+    np.testing.assert_array_equal(rows.obs, again.obs)
+    assert walk_elsewhere(watched, jax.random.key(1), act) is not None
+    assert 0.95 * seen < told.done[-1] - 5_000 <= seen
+    assert told.done == sorted(told.done)
+
+
+def test_an_environment_that_cannot_be_put_anywhere_is_asked_less():
+    assert calibrate.num_steps(make_point()) == 600
+
+
+def test_a_bar_on_a_terminal(asked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    shutil.copytree(asked, tmp_path / "run")
+    stream = io.StringIO()
+    stream.isatty = lambda: True
+    monkeypatch.setattr("sys.stderr", stream)
+    assert calibrate.main([str(tmp_path / "run")]) == 0
+    # 600 steps of its own and 20 starts in each of 7 cells.
+    assert "asking: " in stream.getvalue() and "/2000 [" in stream.getvalue()
+    assert stream.getvalue().split("\r")[-1].strip() == ""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_ctrl_c_gives_a_line(finished, tmp_path: Path):
+    runs = [tmp_path / str(i) for i in range(5)]
+    for out in runs:
+        shutil.copytree(finished.out, out)
+    command = [sys.executable, "-u", "-m", "experiments.calibrate", *map(str, runs)]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "implicit on ant_maze after 81 steps\n", "the first run's table"
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert stderr.strip() == "Stopped."
+    assert not (runs[-1] / "calibration.json").exists()
 
 
 def test_says_why_not(tell, point: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
