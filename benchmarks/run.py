@@ -5,6 +5,7 @@ Every figure is measured in this one process, and so is the matrix-product rate 
 
 import argparse
 import json
+import os
 import platform
 import sys
 import time
@@ -43,6 +44,10 @@ def main() -> int:
     parser.add_argument("--only", choices=PARTS, help="one part of the table")
     parser.add_argument("--out", type=Path, help="JSON file to write; default: benchmarks/results/DEVICE.json")
     arguments = parser.parse_args()
+    if arguments.out is not None and not arguments.out.resolve().parent.is_dir():
+        parser.error(f"--out={arguments.out}. Allowed: a file in a directory that is there.")
+    if arguments.out is not None and (arguments.out.is_dir() or not os.access(arguments.out.resolve().parent, os.W_OK)):
+        parser.error(f"--out={arguments.out} cannot be written. Allowed: a file that can be.")
     use_compilation_cache()
     device = jax.devices()[0].device_kind
     rate = matmul_rate()

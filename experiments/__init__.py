@@ -2,9 +2,13 @@
 
 import sys
 
-from experiments import process, runtime
+from experiments import process
 
-# `python -m experiments.NAME` imports this package before it fills in the program's name.
+# `python -m experiments.NAME` imports this package before it fills in the program's name. First of all: what follows
+# takes seconds to import, and is interrupted, too.
 if sys.argv[:1] == ["-m"]:
     process.be_brief()
+
+from experiments import runtime
+
 runtime.set_cpu_switches()

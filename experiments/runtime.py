@@ -1,6 +1,7 @@
 """What a process needs before it computes: XLA's switches, the compilation cache, and the versions in use."""
 
 import os
+import stat
 import sys
 from importlib import metadata
 from pathlib import Path
@@ -36,12 +37,21 @@ def use_compilation_cache() -> None:
     base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     directory = Path(base) / "jaxplore" / "jax"
     try:
-        # Compiled code is run without being checked: nobody else may write here.
         directory.mkdir(parents=True, exist_ok=True, mode=0o700)
+        others_write = os.name == "posix" and _others_write(directory)
     except OSError:
+        return
+    if others_write:
+        print(f"{directory} can be written to by others, so compiled programs are not kept there", file=sys.stderr)
         return
     jax.config.update("jax_compilation_cache_dir", str(directory))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+def _others_write(directory: Path) -> bool:
+    """Whether anybody else can put files into a directory: compiled code is run without being checked."""
+    found = directory.stat()
+    return found.st_uid != os.getuid() or bool(found.st_mode & (stat.S_IWGRP | stat.S_IWOTH))
 
 
 def versions() -> dict[str, str]:
