@@ -53,7 +53,7 @@ def plot_calibration(
     colours = dict(zip((group.label for group in groups), COLOURS, strict=False))
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(10.4, 4.8), layout="constrained")
-        halves = figure.subfigures(1, 2, width_ratios=(1.15, 1))
+        halves = figure.subfigures(1, 2, squeeze=False, width_ratios=(1.15, 1))[0]
         left, right = (half.subplots() for half in halves)
         ends = []
         for group in groups:

@@ -50,8 +50,8 @@ def panels_of(curves: Sequence[Curves]) -> tuple[Figure, list[Panel]]:
     if count <= MOST_IN_PICTURE:
         figure = Figure(figsize=(6.6, 4.1), layout="constrained")
         return figure, [Panel(figure.subplots(), curves, ())]
-    # Few empty places, and then rather more rows.
-    columns = 3 if count <= 9 else min((4, 5), key=lambda columns: -count % columns)
+    # Few empty places, and then rather few rows.
+    columns = 3 if count <= 9 else min((5, 4), key=lambda columns: -count % columns)
     rows = -(-count // columns)
     figure = Figure(figsize=(2.4 * columns + 0.6, 1.75 * rows + 0.9), layout="constrained")
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)

@@ -246,5 +246,5 @@ def test_more_than_eight_groups_have_a_panel_each(tmp_path: Path, figures: list[
         assert sorted(float(np.asarray(line.get_ydata())[0]) for line in grey) == [j / 20 for j in range(17) if j != i]
         assert (axes.get_xlim(), axes.get_ylim()) == (panels[0].get_xlim(), panels[0].get_ylim())
     # The lowest of each column says what steps are.
-    assert [bool(axes.get_xlabel()) for axes in panels] == [False] * 13 + [True] * 4
+    assert [bool(axes.get_xlabel()) for axes in panels] == [False] * 12 + [True] * 5
     assert check_legends(figures[0]) == ["median", "each seed", "medians of the others"]
