@@ -15,12 +15,14 @@ from typing import Any
 import numpy as np
 
 from envs.base import Environment, EnvState
+from envs.errors import EnvironmentFault
 from experiments import process, runtime
 from experiments.analysis import figures
 from experiments.analysis.calibration import FEWEST, Judged, record
 from experiments.analysis.load import scene_of
 from experiments.analysis.tables import number, text_table
 from experiments.progress import Progress
+from experiments.runs import modules
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
 from experiments.training import build, loop
@@ -128,13 +130,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m experiments.calibrate", description=__doc__)
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="directories of runs with a checkpoint")
     parser.add_argument("--until", type=int, help="ask at the latest checkpoint up to this step (default: the last)")
+    modules.add_flag(parser)
+    process.add_flag(parser)
     arguments = parser.parse_args(argv)
     runtime.use_compilation_cache()
     try:
+        modules.load(arguments.imports)
         for run in arguments.runs:
             print(write(run, arguments.until) + "\n", flush=True)
-    except (RunError, ValueError) as error:
+    except (RunError, ValueError, EnvironmentFault) as error:
         print(f"error: {error}", file=sys.stderr)
+        process.show_cause(error, debug=arguments.debug)
         return 1
     return 0
 

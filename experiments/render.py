@@ -20,6 +20,7 @@ from experiments import process
 from experiments.analysis import video
 from experiments.analysis.video import STILLS, SUFFIXES
 from experiments.progress import track
+from experiments.runs import modules
 from experiments.runs.errors import RunError
 
 if TYPE_CHECKING:
@@ -182,6 +183,8 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
         type=Path,
         help=f"the video to write: .mp4, .gif, or a .png of {STILLS} moments (default: RUN/CAMERA.mp4, ENV.mp4)",
     )
+    modules.add_flag(parser)
+    process.add_flag(parser)
     arguments = parser.parse_args(argv)
     if arguments.seed < 0:
         parser.error(f"--seed={arguments.seed}. Allowed: 0 or more.")
@@ -231,9 +234,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     from envs.errors import EnvironmentFault
 
     try:
+        modules.load([*arguments.imports, *modules.of_env(arguments.env)])
         print(render(arguments))
     except (RunError, ValueError, EnvironmentFault) as error:
         print(f"error: {error}", file=sys.stderr)
+        process.show_cause(error, debug=arguments.debug)
         return 1
     return 0
 
