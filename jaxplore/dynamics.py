@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxplore import normalizer
+from jaxplore import normalizer, validate
 from jaxplore.networks import ACTIVATIONS, MLP
 from jaxplore.normalizer import Normalizer
 from jaxplore.types import Array, Transition
@@ -107,11 +107,14 @@ def model_inputs(state: Normalizers, obs: Array, action: Array) -> Array:
 
 def model_targets(state: Normalizers, obs: Array, next_obs: Array) -> Array:
     """What a network should say: the normalised delta, `[..., O]`."""
+    validate.shape("obs", obs, "...", state.obs.mean.shape[-1])
+    validate.shape("next_obs", next_obs, "...", state.obs.mean.shape[-1])
     return normalizer.normalize(state.delta, next_obs - obs)
 
 
 def apply_delta(state: Normalizers, obs: Array, delta: Array) -> Array:
     """The next observation `[..., O]`, in raw units, that a normalised delta leads to."""
+    validate.shape("obs", obs, "...", state.obs.mean.shape[-1])
     return obs + normalizer.denormalize(state.delta, delta)
 
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxplore import beliefs, dynamics, replay
+from jaxplore import beliefs, dynamics, replay, validate
 from jaxplore.behaviours.base import Behaviour, Experience
 from jaxplore.behaviours.uniform import uniform_actions
 from jaxplore.beliefs.base import Belief
@@ -97,8 +97,9 @@ def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Ex
         An `Explorer`.
 
     Raises:
-        ValueError: the method needs another kind of action, or a reward where there is none;
-            `dynamics.target="one_hot"` where observations are not one-hot; or what a part of the method refuses.
+        ValueError: a size is below 1; the method needs another kind of action, or a reward where there is none;
+            `dynamics.target="one_hot"` where observations are not one-hot; or what a part of the method refuses. When
+            its functions are traced, observations and transitions of other shapes.
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -108,6 +109,7 @@ def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Ex
         >>> explorer.act(jax.random.key(1), explorer.actor(state), jnp.zeros(3)).shape
         (1,)
     """
+    validate.sizes(obs=sizes.obs, action=sizes.action)
     if config.dynamics.target == "one_hot" and not sizes.one_hot_obs:
         raise FieldError(
             "target",
@@ -174,18 +176,21 @@ def adopt(agent: Agent, state: ExplorerState, actor: Actor) -> ExplorerState:
 
 def act(agent: Agent, key: Key, actor: Actor, obs: Array) -> Array:
     """An action `[..., A]` for `obs [..., O]`, as the actor says."""
+    validate.shape("obs", obs, "...", agent.sizes.obs)
     drawn = agent.behaviour.act(key, actor.behaviour, actor.normalizers, obs)
     return jnp.where(actor.uniform, act_uniformly(agent, key, obs), drawn)
 
 
 def act_greedily(agent: Agent, key: Key, actor: Actor, obs: Array) -> Array:
     """The action `[..., A]` that the behaviour holds for the best."""
+    validate.shape("obs", obs, "...", agent.sizes.obs)
     best = agent.behaviour.act_greedily or agent.behaviour.act
     return best(key, actor.behaviour, actor.normalizers, obs)
 
 
 def act_uniformly(agent: Agent, key: Key, obs: Array) -> Array:
     """A uniform action `[..., A]`."""
+    validate.shape("obs", obs, "...", agent.sizes.obs)
     return uniform_actions(key, obs, agent.sizes.action, agent.sizes.discrete)
 
 
@@ -201,6 +206,7 @@ def observe(state: ExplorerState, transitions: Transition, valid: Array) -> Expl
 def improve(agent: Agent, key: Key, state: ExplorerState, obs: Array, num_data: Array) -> tuple[ExplorerState, Metrics]:
     """Fit the belief, draw models from it, improve the behaviour (Algorithm 1, lines 5 to 9)."""
     belief, behaviour = agent.belief, agent.behaviour
+    validate.shape("obs", obs, agent.sizes.obs)
     fit_key, models_key, improve_key = jax.random.split(key, 3)
     fitted, fit_metrics = beliefs.fit(belief, fit_key, state.belief, state.data, state.normalizers, num_data)
     models = belief.sample(models_key, fitted, belief.num_models)
@@ -217,6 +223,8 @@ def assess(agent: Agent, key: Key, state: ExplorerState, transitions: Transition
     belief, bonus = agent.belief, agent.behaviour.bonus
     if belief.predict is None and bonus is None:
         return {}
+    validate.shape("transitions.obs", transitions.obs, "T", agent.sizes.obs)
+    validate.shape("valid", valid, transitions.obs.shape[0])
     # Valid rows take the others' places: a reward may compare rows.
     count = jnp.sum(valid)
     order = jnp.argsort(~valid)[jnp.arange(valid.shape[0]) % jnp.maximum(count, 1)]

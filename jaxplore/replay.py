@@ -61,13 +61,15 @@ def add(state: Replay[Record], batch: Record, valid: Array | None = None) -> Rep
         The buffer with the rows in it.
 
     Raises:
-        ValueError: `B` over the capacity, or a batch whose shapes are not those of the buffer's records.
+        ValueError: `B` over the capacity, a batch whose shapes are not those of the buffer's records, or another number
+            in `valid`.
     """
     _check_batch(state, batch)
     batch_size, limit = jax.tree.leaves(batch)[0].shape[0], capacity(state)
     if batch_size > limit:
         raise ValueError(f"batch of {batch_size} rows does not fit. Allowed: at most the capacity, {limit}.")
     valid = jnp.ones(batch_size, bool) if valid is None else valid
+    validate.shape("valid", valid, batch_size)
     offset = jnp.cumsum(valid.astype(jnp.int32)) - 1
     # Rows that are not valid aim past the end, where the scatter drops them.
     index = jnp.where(valid, (state.position + offset) % limit, limit)

@@ -7,10 +7,12 @@ nearest match.
 import contextlib
 import difflib
 import math
+import numbers
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-import jax
+import jax.core
+import numpy as np
 
 
 class FieldError(ValueError):
@@ -84,6 +86,37 @@ def at_least(field: str, value: int, low: int) -> None:
     """Raise unless `value` is a whole number of at least `low`."""
     if isinstance(value, bool) or not isinstance(value, int) or value < low:
         raise FieldError(field, value, f"a whole number, {low} or more", "is out of range")
+
+
+def sizes(**values: int) -> None:
+    """Raise unless each value, called as its keyword, is a whole number of at least 1; NumPy's are, too."""
+    for field, value in values.items():
+        at_least(field, int(value) if isinstance(value, numbers.Integral) else value, 1)
+
+
+def shape(field: str, value: Any, *wanted: int | str) -> None:
+    """Raise unless an array has the shape that is wanted: what JAX would broadcast, or refuse in words of its own.
+
+    Args:
+        field: what the array is called.
+        value: the array, which may be traced.
+        *wanted: the length of each axis; a letter stands for any but 0, and `"..."`, at the start, for any axes.
+
+    Example:
+        >>> import numpy as np
+        >>> shape("obs", np.zeros((5, 3)), "B", 3)
+        >>> shape("obs", np.zeros((5, 1)), "...", 3)
+        Traceback (most recent call last):
+        jaxplore.validate.FieldError: obs=(5, 1) is its shape. Allowed: shape [..., 3].
+    """
+    given, free = np.shape(value), wanted[:1] == ("...",)
+    axes = wanted[1:] if free else wanted
+    last = given[len(given) - len(axes) :] if free else given
+    if len(last) == len(axes) and all(n > 0 if isinstance(w, str) else n == w for n, w in zip(last, axes, strict=True)):
+        return
+    letters = [axis for axis in axes if isinstance(axis, str)]
+    least = f", {' and '.join(letters)} 1 or more" if letters else ""
+    raise FieldError(field, given, f"shape [{', '.join(map(str, wanted))}]{least}", "is its shape")
 
 
 def known(value: Any) -> bool:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from jaxplore import normalizer, replay
+from jaxplore import normalizer, replay, validate
 from jaxplore.behaviours.base import Behaviour, Experience
 from jaxplore.behaviours.rollout import World, rollout
 from jaxplore.beliefs.base import Belief
@@ -170,7 +170,7 @@ def make_gradient_policy(
         `imagined_reward_p95`, `saturation` (mean absolute action of the squashed mean) and `gradient` (its norm).
 
     Raises:
-        ValueError: the belief predicts nothing, or which of finitely many states comes next.
+        ValueError: a size below 1; the belief predicts nothing, or which of finitely many states comes next.
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -183,6 +183,7 @@ def make_gradient_policy(
         >>> behaviour.act(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
         (5, 1)
     """
+    validate.sizes(obs_size=obs_size, action_size=action_size)
     config = config or GradientPolicyConfig()
     if belief.predict is None or belief.encoding.is_probability:
         raise ValueError(

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxplore import normalizer, replay
+from jaxplore import normalizer, replay, validate
 from jaxplore.behaviours.base import (
     Behaviour,
     Experience,
@@ -118,7 +118,7 @@ def make_imagination(
         transitions that were not finite, and dropped).
 
     Raises:
-        ValueError: the belief does not predict.
+        ValueError: the belief does not predict, or a size is below 1.
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -134,6 +134,7 @@ def make_imagination(
     """
     if belief.predict is None:
         raise ValueError("belief predicts nothing, so nothing can be imagined. Allowed: a belief with `predict`.")
+    validate.sizes(obs_size=obs_size, action_size=action_size)
     flag = jnp.zeros((), bool)
     example = Transition(jnp.zeros(obs_size), jnp.zeros(action_size), jnp.zeros(()), jnp.zeros(obs_size), flag, flag)
     parts = Imagination(belief, score, learner, example, config)

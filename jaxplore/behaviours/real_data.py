@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxplore import replay
+from jaxplore import replay, validate
 from jaxplore.behaviours.base import (
     Behaviour,
     Experience,
@@ -93,7 +93,7 @@ def make_reactive(
         A `Behaviour`. The metrics are the learner's, from the last update.
 
     Raises:
-        ValueError: the belief does not predict.
+        ValueError: the belief does not predict, or a size is below 1.
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -108,6 +108,7 @@ def make_reactive(
     """
     if belief.predict is None:
         raise ValueError("belief predicts nothing, so nothing can be labelled. Allowed: a belief with `predict`.")
+    validate.sizes(obs_size=obs_size, action_size=action_size)
     config = config or ReactiveConfig()
     parts = Reactive(belief, score, learner, (obs_size, action_size), config)
     return Behaviour(
@@ -175,6 +176,9 @@ def make_model_free(
     Returns:
         A `Behaviour`. The metrics are the learner's, from the last update.
 
+    Raises:
+        FieldError: a size below 1.
+
     Example:
         >>> import jax, jax.numpy as jnp
         >>> from jaxplore import dynamics, learners
@@ -184,6 +188,7 @@ def make_model_free(
         >>> behaviour.act_greedily(jax.random.key(1), actor, dynamics.init_normalizers(4, 2), jnp.eye(4)).shape
         (4, 2)
     """
+    validate.sizes(obs_size=obs_size, action_size=action_size)
     config = config or ModelFreeConfig()
 
     def improve(key: Key, state: Any, experience: Experience) -> tuple[Any, Metrics]:

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from jaxplore import validate
 from jaxplore.behaviours.base import Behaviour, Experience
 from jaxplore.behaviours.mcts import MCTSConfig, Tables, make_mcts
 from jaxplore.beliefs.base import Belief
@@ -70,8 +71,8 @@ def make_tree_search(
         `utility` and `utility_max`, and `agreement`, the share where all models go to the same state.
 
     Raises:
-        ValueError: the belief does not predict, `config` does not fit the number of actions, or next states are to be
-            sampled and the belief does not predict probabilities.
+        ValueError: a size is below 1, the belief does not predict, `config` does not fit the number of actions, or next
+            states are to be sampled and the belief does not predict probabilities.
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -86,6 +87,7 @@ def make_tree_search(
     """
     if belief.predict is None:
         raise ValueError("belief predicts nothing, so nothing can be searched. Allowed: a belief with `predict`.")
+    validate.sizes(num_states=num_states, num_actions=num_actions)
     config = config or MCTSConfig()
     samples = config.model_step == "sample"
     if samples and not belief.encoding.is_probability:

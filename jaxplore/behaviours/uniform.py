@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 
+from jaxplore import validate
 from jaxplore.behaviours.base import Behaviour
 from jaxplore.dynamics import Normalizers
 from jaxplore.types import Array, Key
@@ -20,6 +21,9 @@ def uniform_actions(key: Key, obs: Array, action_size: int, discrete: bool = Fal
 def make_uniform(action_size: int, discrete: bool = False) -> Behaviour:
     """Uniform actions, always: in [-1, 1], or one of `action_size` choices.
 
+    Raises:
+        FieldError: `action_size` below 1.
+
     Example:
         >>> import jax, jax.numpy as jnp
         >>> from jaxplore import dynamics
@@ -27,6 +31,7 @@ def make_uniform(action_size: int, discrete: bool = False) -> Behaviour:
         >>> behaviour.act(jax.random.key(0), (), dynamics.init_normalizers(3, 2), jnp.zeros((5, 3))).shape
         (5, 2)
     """
+    validate.sizes(action_size=action_size)
 
     def act(key: Key, actor: Any, normalizers: Normalizers, obs: Array) -> Array:
         return uniform_actions(key, obs, action_size, discrete)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from jaxplore import validate
 from jaxplore.dynamics import DELTA, Encoding, Normalizers, Prediction
 from jaxplore.replay import Replay
 from jaxplore.types import Array, Key, Metrics, Transition, no_metrics
@@ -98,10 +99,12 @@ class Belief(NamedTuple):
         """What models predict of `obs [N, O]` and `action [N, A]`, raw units: `[M, N, O]`.
 
         Raises:
-            ValueError: this belief predicts nothing.
+            ValueError: this belief predicts nothing, or observations or actions have another shape.
         """
         if self.predict is None:
             raise ValueError("the belief predicts nothing. Allowed: a belief with `predict`.")
+        validate.shape("obs", obs, "N", normalizers.obs.mean.shape[-1])
+        validate.shape("action", action, obs.shape[0], normalizers.action.mean.shape[-1])
         return self.predict(models, self.encoding.inputs(normalizers, obs, action))
 
     def judge(self, models: Any, normalizers: Normalizers, transitions: Transition) -> Judgement:

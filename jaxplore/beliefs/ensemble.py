@@ -138,8 +138,9 @@ def make_spec(
     """The network, the optimiser and the encoding that the configurations describe.
 
     Raises:
-        ValueError: Gaussian members that are to predict probabilities.
+        ValueError: a size below 1, or Gaussian members that are to predict probabilities.
     """
+    validate.sizes(obs_size=obs_size, action_size=action_size)
     if gaussian and dynamics_config.target == "one_hot":
         problem = "does not fit DynamicsConfig.target='one_hot': probabilities have no variance of their own"
         raise FieldError("gaussian", gaussian, "'delta'", problem)
@@ -228,6 +229,7 @@ def sample(spec: EnsembleSpec, key: Key, state: EnsembleState, num: int) -> Para
 
 def predict(spec: EnsembleSpec, models: Params, inputs: Array) -> Prediction:
     """Predictions `[M, N, O]` of the members `models` for `inputs [N, O + A]`; see `Belief.predict`."""
+    validate.shape("inputs", inputs, "N", spec.input_size)
     last = jax.vmap(lambda params: networks.apply(spec.network, params, inputs))(models)
     if not spec.gaussian:
         return Prediction(spec.encoding.outputs(last))
@@ -266,8 +268,8 @@ def make_ensemble_belief(
         metrics are `loss` and `squared_error`, means over members and batch.
 
     Raises:
-        ValueError: fewer than one member; Gaussian members that are to predict probabilities; at `sample`, more models
-            than there are members.
+        ValueError: a size below 1, or fewer than one member; Gaussian members that are to predict probabilities; at
+            `sample`, more models than there are members.
 
     Example:
         >>> import jax, jax.numpy as jnp

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxplore import dynamics, networks, replay
+from jaxplore import dynamics, networks, replay, validate
 from jaxplore.beliefs.base import Belief, FitConfig, make_optimizer
 from jaxplore.beliefs.generator import Generator, GeneratorConfig, make_generator
 from jaxplore.beliefs.svgd import AmortizedSVGD, SVGDConfig, SVGDState, make_amortized_svgd
@@ -24,6 +24,8 @@ class GeneratorBelief(NamedTuple):
     apply: Callable[[Params, Array], Array]
     """`apply(params, inputs [N, O + A]) -> [N, O]`: one network's prediction."""
     encoding: Encoding
+    input_size: int
+    """`O + A`"""
     batch_size: int
     svgd: SVGDConfig
 
@@ -49,6 +51,9 @@ def make_generator_belief(
     Returns:
         A `Belief` whose models are parameter trees.
 
+    Raises:
+        FieldError: a size below 1.
+
     Example:
         >>> import jax, jax.numpy as jnp
         >>> belief = make_generator_belief(3, 1, DynamicsConfig(hidden=(16,)))
@@ -57,6 +62,7 @@ def make_generator_belief(
         >>> belief.predict(models, jnp.zeros((5, 4))).mean.shape
         (32, 5, 3)
     """
+    validate.sizes(obs_size=obs_size, action_size=action_size)
     fit_config, svgd_config = fit_config or FitConfig(), svgd_config or SVGDConfig()
     dynamics_config = dynamics_config or DynamicsConfig()
     encoding = ENCODINGS[dynamics_config.target]
@@ -67,7 +73,8 @@ def make_generator_belief(
 
     apply = functools.partial(_run, network, encoding)
     posterior = make_amortized_svgd(generator, apply, obs_size, make_optimizer(fit_config), svgd_config)
-    parts = GeneratorBelief(generator, posterior, apply, encoding, fit_config.batch_size, svgd_config)
+    input_size = obs_size + action_size
+    parts = GeneratorBelief(generator, posterior, apply, encoding, input_size, fit_config.batch_size, svgd_config)
     return Belief(
         init=posterior.init,
         update=functools.partial(update, parts),
@@ -97,6 +104,7 @@ def update(
 
 def sample(parts: GeneratorBelief, key: Key, state: SVGDState, num: int) -> Params:
     """`num` networks, each leaf with a leading axis `M = num`; the particles themselves where their noise is fixed."""
+    validate.at_least("num", num, 1)
     if parts.svgd.redraw == "fixed" and num == parts.svgd.num_particles:
         return parts.generator.sample(state.eta, state.z)
     return parts.generator.sample(state.eta, parts.generator.sample_noise(key, num))
@@ -104,6 +112,7 @@ def sample(parts: GeneratorBelief, key: Key, state: SVGDState, num: int) -> Para
 
 def predict(parts: GeneratorBelief, models: Params, inputs: Array) -> Prediction:
     """What networks say of `inputs [N, O + A]`: `[M, N, O]`."""
+    validate.shape("inputs", inputs, "N", parts.input_size)
     return Prediction(jax.vmap(parts.apply, in_axes=(0, None))(models, inputs))
 
 

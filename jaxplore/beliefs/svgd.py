@@ -176,6 +176,9 @@ def stein_direction(scores: Array, repulsion_values: Array, config: SVGDConfig) 
         A `SteinDirection`. On particles that are free to move (no generator) with the same points in both roles,
         `drive + repulsion` is the update of Liu & Wang (2016).
 
+    Raises:
+        FieldError: scores and values of other shapes, or of different numbers of particles.
+
     Example:
         Two particles that both fit perfectly move apart:
 
@@ -185,7 +188,9 @@ def stein_direction(scores: Array, repulsion_values: Array, config: SVGDConfig) 
         >>> bool(direction.repulsion[0, 0, 0] < 0 < direction.repulsion[1, 0, 0])
         True
     """
+    validate.shape("repulsion_values", repulsion_values, "M", "r", "O")
     num = repulsion_values.shape[0]
+    validate.shape("scores", scores, num, "n", repulsion_values.shape[2])
     # A lone particle has nobody else's score to follow.
     self_weight = 1.0 if num == 1 else config.self_weight
     norm = num - 1 + self_weight

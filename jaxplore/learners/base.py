@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+from jaxplore import validate
 from jaxplore.types import Array, Key, Metrics, Transition
 
 
@@ -39,3 +40,40 @@ class Learner(NamedTuple):
     adopt: Callable[[Any, Any], Any] | None = None
     """`adopt(state, actor) -> state`: with the policy of another state's `actor` and everything else, such as critics,
     as in `state`. None: it has no policy that can be taken over."""
+
+
+def checked(learner: Learner, obs_size: int, action_size: int) -> Learner:
+    """The learner, refusing observations and batches of other shapes, when they are traced.
+
+    Args:
+        learner: of your own, say; those of this package are checked.
+        obs_size: `O`.
+        action_size: `A`.
+
+    Returns:
+        A `Learner` that raises `FieldError` where an observation is not `[..., O]`, or a batch is empty or of other
+        widths.
+
+    Raises:
+        FieldError: a size below 1.
+    """
+    validate.sizes(obs_size=obs_size, action_size=action_size)
+
+    def act(key: Key, actor: Any, obs: Array) -> Array:
+        validate.shape("obs", obs, "...", obs_size)
+        return learner.act(key, actor, obs)
+
+    def act_greedily(actor: Any, obs: Array) -> Array:
+        validate.shape("obs", obs, "...", obs_size)
+        return learner.act_greedily(actor, obs)
+
+    def update(key: Key, state: Any, batch: Transition) -> tuple[Any, Metrics]:
+        validate.shape("batch.obs", batch.obs, "B", obs_size)
+        num = batch.obs.shape[0]
+        validate.shape("batch.action", batch.action, num, action_size)
+        validate.shape("batch.next_obs", batch.next_obs, num, obs_size)
+        validate.shape("batch.reward", batch.reward, num)
+        validate.shape("batch.terminated", batch.terminated, num)
+        return learner.update(key, state, batch)
+
+    return learner._replace(act=act, act_greedily=act_greedily, update=update)

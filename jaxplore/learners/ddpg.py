@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from jaxplore.learners.base import Learner
+from jaxplore.learners.base import Learner, checked
 from jaxplore.networks import ACTIVATIONS, INITIALIZERS, MLP, apply
 from jaxplore.types import Array, Key, Metrics, Params, Transition
 from jaxplore.validate import Checks
@@ -295,6 +295,9 @@ def make_ddpg(obs_size: int, action_size: int, config: DDPGConfig | None = None)
         `q_loss` (mean squared error, without the penalty), `policy_loss`, `q` (mean value of the batch), `noise_std`
         (after the update) and `distance` (between a perturbed policy's actions and the policy's, on the batch).
 
+    Raises:
+        FieldError: a size below 1; when it is traced, observations or a batch of other shapes.
+
     Example:
         >>> import jax, jax.numpy as jnp
         >>> ddpg = make_ddpg(3, 1, DDPGConfig(hidden=(32, 32), batch_size=8))
@@ -307,7 +310,7 @@ def make_ddpg(obs_size: int, action_size: int, config: DDPGConfig | None = None)
     """
     config = config or DDPGConfig()
     networks = make_networks(obs_size, action_size, config)
-    return Learner(
+    learner = Learner(
         init=partial(init, networks),
         actor=get_actor,
         act=partial(act, networks),
@@ -315,3 +318,4 @@ def make_ddpg(obs_size: int, action_size: int, config: DDPGConfig | None = None)
         update=partial(update, networks),
         batch_size=config.batch_size,
     )
+    return checked(learner, obs_size, action_size)

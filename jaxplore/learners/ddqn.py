@@ -15,7 +15,7 @@ import optax
 from flax import struct
 
 from jaxplore import validate
-from jaxplore.learners.base import Learner
+from jaxplore.learners.base import Learner, checked
 from jaxplore.networks import ACTIVATIONS, INITIALIZERS, MLP, apply
 from jaxplore.types import Array, Key, Metrics, Params, Transition
 from jaxplore.validate import Checks
@@ -192,7 +192,8 @@ def make_ddqn(obs_size: int, num_actions: int, config: DDQNConfig | None = None)
         actions) and `epsilon` (the share of random actions after the update).
 
     Raises:
-        ValueError: `num_actions` is below 2.
+        FieldError: `num_actions` below 2 or `obs_size` below 1; when it is traced, observations or a batch of other
+            shapes.
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -206,7 +207,7 @@ def make_ddqn(obs_size: int, num_actions: int, config: DDQNConfig | None = None)
     """
     config = config or DDQNConfig()
     networks = make_networks(obs_size, num_actions, config)
-    return Learner(
+    learner = Learner(
         init=partial(init, networks),
         actor=partial(get_actor, networks),
         act=partial(act, networks),
@@ -214,3 +215,4 @@ def make_ddqn(obs_size: int, num_actions: int, config: DDQNConfig | None = None)
         update=partial(update, networks),
         batch_size=config.batch_size,
     )
+    return checked(learner, obs_size, num_actions)

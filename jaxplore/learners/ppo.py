@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from jaxplore import validate
 from jaxplore.networks import ACTIVATIONS, INITIALIZERS, MLP, apply
 from jaxplore.types import Array, Key, Metrics, Params, Transition
 from jaxplore.validate import Checks
@@ -349,7 +350,11 @@ def update(
     networks: PPONetworks, key: Key, state: PPOState, rollout: Rollout, last_obs: Array, num: Array
 ) -> tuple[PPOState, Metrics]:
     """All gradient steps on the first `num` steps of `rollout [T, ...]`; see `PPO.update`."""
-    config = networks.config
+    config, steps = networks.config, rollout.transitions
+    validate.shape("rollout.transitions.obs", steps.obs, "T", networks.obs_size)
+    validate.shape("rollout.transitions.action", steps.action, len(steps.obs), networks.action_size)
+    for field in ("intrinsic_reward", "log_prob"):
+        validate.shape(f"rollout.{field}", getattr(rollout, field), len(steps.obs))
     capacity, count = len(rollout.log_prob), jnp.maximum(num, 1)
     held = jnp.arange(capacity) < num
     values, both = advantages(networks, state.params, rollout, last_obs, num)
@@ -384,6 +389,9 @@ def make_ppo(obs_size: int, action_size: int, config: PPOConfig | None = None) -
         nats), `kl` (of the policy from the one that acted, estimated) and `clipped` (share of steps whose ratio is out
         of the clip), from the last gradient step; `intrinsic_value` and `extrinsic_value` are means over the steps.
 
+    Raises:
+        FieldError: a size below 1; when `update` is traced, steps of other shapes, or none.
+
     Example:
         >>> import jax, jax.numpy as jnp
         >>> ppo = make_ppo(3, 1, PPOConfig(hidden=(8,), rollout_steps=4, minibatch_size=2))
@@ -396,6 +404,7 @@ def make_ppo(obs_size: int, action_size: int, config: PPOConfig | None = None) -
         >>> ppo.act_greedily(ppo.actor(state), obs[0]).shape
         (1,)
     """
+    validate.sizes(obs_size=obs_size, action_size=action_size)
     networks = make_networks(obs_size, action_size, config or PPOConfig())
     return PPO(
         init=partial(init, networks),

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from jaxplore.learners.base import Learner
+from jaxplore.learners.base import Learner, checked
 from jaxplore.networks import (
     ACTIVATIONS,
     INITIALIZERS,
@@ -227,6 +227,9 @@ def make_sac(obs_size: int, action_size: int, config: SACConfig | None = None) -
         A `Learner`. The metrics of `update` are `q_loss`, `v_loss`, `policy_loss`, `q` (mean value of the batch) and
         `entropy` (of the policy on the batch, nats); with `learn_alpha` also `alpha`, after the update.
 
+    Raises:
+        FieldError: a size below 1; when it is traced, observations or a batch of other shapes.
+
     Example:
         >>> import jax, jax.numpy as jnp
         >>> sac = make_sac(3, 1, SACConfig(hidden=(32, 32), batch_size=8))
@@ -239,7 +242,7 @@ def make_sac(obs_size: int, action_size: int, config: SACConfig | None = None) -
     """
     config = config or SACConfig()
     networks = make_networks(obs_size, action_size, config)
-    return Learner(
+    learner = Learner(
         init=partial(init, networks),
         actor=get_actor,
         act=partial(act, networks),
@@ -248,3 +251,4 @@ def make_sac(obs_size: int, action_size: int, config: SACConfig | None = None) -
         batch_size=config.batch_size,
         adopt=adopt,
     )
+    return checked(learner, obs_size, action_size)

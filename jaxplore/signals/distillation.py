@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from jaxplore import normalizer
+from jaxplore import normalizer, validate
 from jaxplore.networks import ACTIVATIONS, MLP, apply
 from jaxplore.normalizer import Normalizer
 from jaxplore.types import Array, Key, Params
@@ -88,6 +88,9 @@ def make_rnd(obs_size: int, config: RNDConfig | None = None) -> RND:
     Returns:
         An `RND`.
 
+    Raises:
+        FieldError: `obs_size` below 1; when it is traced, observations or weights of another shape.
+
     Example:
         >>> import jax, jax.numpy as jnp
         >>> rnd = make_rnd(3, RNDConfig(hidden=(16,), features=8))
@@ -96,10 +99,11 @@ def make_rnd(obs_size: int, config: RNDConfig | None = None) -> RND:
         >>> bool(rnd.error(state, jnp.ones(3)) < error)
         True
     """
+    validate.sizes(obs_size=obs_size)
     config = config or RNDConfig()
-    shape = (config.features, config.activation, "orthogonal_relu", "orthogonal_relu")
-    target = MLP(config.hidden, *shape)
-    predictor = MLP((*config.hidden, *(config.features,) * config.extra_layers), *shape)
+    form = (config.features, config.activation, "orthogonal_relu", "orthogonal_relu")
+    target = MLP(config.hidden, *form)
+    predictor = MLP((*config.hidden, *(config.features,) * config.extra_layers), *form)
     optimizer = optax.adam(config.lr)
 
     def init(key: Key) -> RNDState:
@@ -108,11 +112,14 @@ def make_rnd(obs_size: int, config: RNDConfig | None = None) -> RND:
         return RNDState(target.init(target_key, jnp.zeros(obs_size))["params"], params, optimizer.init(params))
 
     def distance(predicting: Params, fixed: Params, obs: Array) -> Array:
+        validate.shape("obs", obs, "...", obs_size)
         seen = jnp.clip(obs, -config.obs_clip, config.obs_clip)
         wanted = jax.lax.stop_gradient(apply(target, fixed, seen))
         return jnp.mean((apply(predictor, predicting, seen) - wanted) ** 2, axis=-1)
 
     def update(state: RNDState, obs: Array, weights: Array) -> tuple[RNDState, Array]:
+        validate.shape("weights", weights, *obs.shape[:-1])
+
         def loss(params: Params) -> Array:
             return jnp.sum(weights * distance(params, state.target, obs)) / jnp.maximum(jnp.sum(weights), 1.0)
 

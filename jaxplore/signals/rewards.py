@@ -51,6 +51,7 @@ def variance(prediction: Prediction, delta_std: Array | None = None) -> Array:
     _check(prediction)
     spread = jnp.var(prediction.mean, axis=0)
     if delta_std is not None:
+        validate.shape("delta_std", delta_std, prediction.mean.shape[2])
         spread = spread * delta_std[None, :] ** 2
     return jnp.sum(spread, axis=-1)
 
@@ -75,7 +76,7 @@ def jensen_renyi(prediction: Prediction, decay: float = 0.1) -> Array:
         concave, so where variances differ and means do not it falls a little below.
 
     Raises:
-        FieldError: `decay` outside of (0, 1].
+        FieldError: `decay` outside of (0, 1], or a prediction of another shape.
 
     Example:
         >>> import jax.numpy as jnp
@@ -125,12 +126,16 @@ def jensen_shannon(prediction: Prediction) -> Array:
     Returns:
         `[N]`, in [0, ln m].
 
+    Raises:
+        FieldError: a prediction of another shape.
+
     Example:
         >>> import jax.numpy as jnp
         >>> certain = Prediction(jnp.array([[[1.0, 0.0]], [[0.0, 1.0]]]))
         >>> round(float(jensen_shannon(certain)[0]), 4)  # ln 2
         0.6931
     """
+    _check(prediction)
     entropy = jnp.sum(jax.scipy.special.entr(prediction.mean), axis=-1)
     mixture = jnp.sum(jax.scipy.special.entr(jnp.mean(prediction.mean, axis=0)), axis=-1)
     return mixture - jnp.mean(entropy, axis=0)
@@ -151,14 +156,20 @@ def prediction_error(prediction: Prediction, delta: Array, scale: Array | None =
     Returns:
         `[N]`, at least 0.
 
+    Raises:
+        FieldError: a prediction, change or scale of another shape.
+
     Example:
         >>> import jax.numpy as jnp
         >>> prediction = Prediction(jnp.array([[[0.0, 0.0]], [[2.0, 0.0]]]))
         >>> float(prediction_error(prediction, jnp.array([[0.0, 3.0]]))[0])
         10.0
     """
+    _check(prediction)
+    validate.shape("delta", delta, *prediction.mean.shape[1:])
     error = jnp.mean(prediction.mean, axis=0) - delta
     if scale is not None:
+        validate.shape("scale", scale, prediction.mean.shape[2])
         error = error * scale[None]
     return jnp.sum(error**2, axis=-1)
 
@@ -173,11 +184,15 @@ def trajectory_spread(delta: Array) -> Array:
         `[N]`, the same number for every actor: the unbiased standard deviation over actors, summed over entries; 0 for
         a single actor.
 
+    Raises:
+        FieldError: changes of another shape.
+
     Example:
         >>> import jax.numpy as jnp
         >>> trajectory_spread(jnp.array([[0.0], [2.0]])).tolist()
         [1.4142135381698608, 1.4142135381698608]
     """
+    validate.shape("delta", delta, "N", "O")
     num_actors = delta.shape[0]
     if num_actors < 2:
         return jnp.zeros(num_actors)

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import numpy as np
 import pytest
 
 from jaxplore import validate
@@ -98,3 +99,29 @@ def test_open_ends_are_left_out():
     for value, ends in ((0.0, {"open_low": True}), (1.0, {"open_high": True})):
         with pytest.raises(FieldError, match=r"a finite number in "):
             validate.in_range("rate", value, 0.0, 1.0, **ends)
+
+
+@pytest.mark.parametrize(
+    ("given", "wanted", "allowed"),
+    [
+        ((5, 1), ("B", 3), r"\[B, 3\], B 1 or more\."),
+        ((0, 3), ("B", 3), r"\[B, 3\], B 1 or more\."),
+        ((3,), ("B", 3), r"\[B, 3\]"),
+        ((2, 5, 3), ("B", 3), r"\[B, 3\]"),
+        ((3, 1), ("...", 3), r"\[\.\.\., 3\]\."),
+        ((), ("...", 3), r"\[\.\.\., 3\]\."),
+        ((1,), (), r"\[\]\."),
+        ((4, 0), ("N", "O"), r"\[N, O\], N and O 1 or more\."),
+    ],
+)
+def test_another_shape_is_refused(given, wanted, allowed):
+    with pytest.raises(
+        FieldError, match=rf"rows=\({', '.join(map(str, given))},?\) is its shape\. Allowed: .*{allowed}"
+    ):
+        validate.shape("rows", np.zeros(given), *wanted)
+
+
+def test_shapes_that_are_wanted_pass():
+    # letters are any length but 0, three dots any axes
+    for given, wanted in (((5, 3), ("B", 3)), ((3,), ("...", 3)), ((0, 2, 3), ("...", 3)), ((), ()), ((2,), (2,))):
+        validate.shape("rows", np.zeros(given), *wanted)
