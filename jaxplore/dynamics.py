@@ -100,9 +100,11 @@ def update_normalizers(state: Normalizers, transitions: Transition, valid: Array
 
 def model_inputs(state: Normalizers, obs: Array, action: Array) -> Array:
     """What a network sees: `obs [..., O]`, `action [..., A]` -> `[..., O + A]`, normalised."""
-    # Actions are within [-1, 1] anyway, and a policy that climbs a gradient needs theirs everywhere.
-    inputs = [normalizer.normalize(state.obs, obs), normalizer.normalize(state.action, action, limit=None)]
-    return jnp.concatenate(inputs, axis=-1)
+    free = normalizer.normalize(state.action, action, limit=None)
+    limited = jnp.clip(free, -normalizer.LIMIT, normalizer.LIMIT)
+    # A choice that was never taken is far away, too; but a policy that climbs a gradient needs the action's everywhere.
+    seen = free + jax.lax.stop_gradient(limited - free)
+    return jnp.concatenate([normalizer.normalize(state.obs, obs), seen], axis=-1)
 
 
 def model_targets(state: Normalizers, obs: Array, next_obs: Array) -> Array:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxplore import dynamics, normalizer
+from jaxplore import beliefs, dynamics, normalizer, rewards
 from jaxplore.types import Transition
 
 RNG = np.random.default_rng(0)
@@ -103,11 +103,40 @@ def test_an_entry_that_stood_still_is_not_a_million_times_as_far_as_the_rest():
 
 
 def test_a_belief_sees_and_aims_at_what_is_within_the_limit():
-    # the action is as it is: within [-1, 1] anyway
-    state = dynamics.init_normalizers(2, 1)
-    obs, action = jnp.array([[50.0, -0.5]]), jnp.array([[40.0]])
-    np.testing.assert_array_equal(dynamics.model_inputs(state, obs, action), [[10.0, -0.5, 40.0]])
+    # and of an action the gradient goes through wherever it is
+    state = dynamics.init_normalizers(2, 2)
+    obs, action = jnp.array([[50.0, -0.5]]), jnp.array([[40.0, 0.7]])
+    inputs, pull = jax.vjp(lambda obs, action: dynamics.model_inputs(state, obs, action), obs, action)
+    np.testing.assert_array_equal(inputs, np.array([[10.0, -0.5, 10.0, 0.7]], np.float32))
+    obs_gradient, action_gradient = pull(jnp.ones((1, 4)))
+    np.testing.assert_array_equal(obs_gradient, [[0.0, 1.0]])
+    np.testing.assert_array_equal(action_gradient, [[1.0, 1.0]])
     np.testing.assert_array_equal(dynamics.model_targets(state, obs, obs + 30.0), [[10.0, 10.0]])
+
+
+def test_rewards_stay_bounded_where_an_entry_has_hardly_moved():
+    # as in Humanoid-v5: a contact force of 0 and a constant of 1e5, each with a jitter, and an entry as usual; 1 of 3
+    # choices is never taken. Then the first two jump, by that choice. Two models say 1 and -1 times what they see of
+    # the observation, and of the choice in the last entry: by hand each of the three is 10 away or, the last, 10 and
+    # what it sees; a variance of 1.6e11 without the limit
+    rng = np.random.default_rng(2)
+    obs = jnp.float32(np.array([0.0, 1e5, 0.0]) + np.array([1e-6, 1e-2, 1.0]) * rng.normal(size=(501, 3)))
+    flag, action = jnp.zeros(500, bool), jnp.eye(3)[rng.integers(0, 2, size=500)]
+    rows = Transition(obs[:-1], action, jnp.zeros(500), obs[1:], flag, flag)
+    state = dynamics.update_normalizers(dynamics.init_normalizers(3, 3), rows, ~flag)
+    jumped, last = jnp.array([[400.0, 2e5, 0.0]]), jnp.eye(3)[2:]
+    says = jnp.hstack([jnp.eye(3), jnp.zeros((3, 2)), jnp.eye(3)[:, 2:]])
+    models = jnp.stack([says, -says])
+    belief = beliefs.make_no_belief()._replace(
+        predict=lambda models, inputs: dynamics.Prediction(jnp.einsum("moi,ni->mno", models, inputs))
+    )
+    one = Transition(jumped, last, rows.reward[:1], obs[-1:], flag[:1], flag[:1])
+    prediction, target = belief.judge(models, state, one)
+    seen = 10.0 - float(state.obs.mean[2] / state.obs.std[2])
+    assert rewards.variance(prediction)[0] == pytest.approx(100 + 100 + seen**2, rel=1e-5)
+    assert rewards.prediction_error(prediction, target)[0] == pytest.approx(100 + 100 + float(target[0, 2]) ** 2)
+    in_obs_units = state.delta.std / state.obs.std
+    assert rewards.prediction_error(prediction, target, in_obs_units)[0] < 3 * (2 * 10) ** 2
 
 
 @pytest.mark.parametrize(
