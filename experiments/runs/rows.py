@@ -76,6 +76,7 @@ FIELDS: dict[str, Field] = {
             ("fit/kernel_mean", "0 to 1", "mean of the kernel over pairs of particles"),
             ("fit/likelihood_std", "per entry of a prediction", "sigma, mean over entries"),
             ("fit/gradient_norm", "", "of the generator's gradient"),
+            ("fit/dead_features", "0 to 1", "share of the generator's features that are the same for every z"),
         ),
         *_fields(
             "policy",

@@ -16,12 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxplore import validate
-from jaxplore.networks import MLP, apply
+from jaxplore.networks import ACTIVATIONS, MLP, apply
 from jaxplore.types import Array, Key, Params
 from jaxplore.validate import Checks
 
 Noise = Literal["shared", "per_layer"]
 InitStd = Literal["match_example", "he", "lecun"]
+
+NUM_CALIBRATION = 512
+"""Draws of z by which heads are scaled at the start."""
+DEAD_STD = 1e-3
+"""A feature whose standard deviation over z is below this makes no difference between networks."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,14 @@ class GeneratorConfig:
     He's sqrt(2 / fan_in), or LeCun's sqrt(1 / fan_in)."""
     constant_fraction: float = 0.5
     """Share of that variance that does not depend on z, in [0, 1). 0: unrelated networks; near 1: nearly equal ones."""
+    activation: str = "relu"
+    """Of the features that a layer generator makes of z. Paper: `relu`, whose features die: what depends on z is noise
+    to a fit, which pushes it down until all are 0 for every z, and all networks are one. `tanh` cannot."""
+    normalize: bool = False
+    """Whether features are normalised over their units, for each z: mean 0 and variance 1."""
+    num_generators: int = 1
+    """K, generators of their own within one belief, each with its own features and heads, and `num_particles / K` of
+    the networks. Networks of one generator err together, those of several apart. Paper: 1."""
     bias_std: float = 0.1
     """The same for entries of leaves with fewer than two axes (biases, scales), around the example's value."""
 
@@ -50,6 +63,8 @@ class GeneratorConfig:
         checks.one_of("init_std", get_args(InitStd))
         checks.in_range("constant_fraction", 0.0, 1.0, open_high=True)
         checks.in_range("bias_std", 0.0)
+        checks.one_of("activation", ACTIVATIONS)
+        checks.at_least("num_generators", 1)
 
 
 class Generator(NamedTuple):
@@ -63,6 +78,9 @@ class Generator(NamedTuple):
     """`generate(eta, z) -> theta`: one network's parameters from one z, shaped like the example."""
     sample: Callable[[Params, Array], Params]
     """`sample(eta, zs) -> thetas`: `generate` under `vmap` over z; every leaf gets a leading axis `M`."""
+    features: Callable[[Params, Array], Array] | None = None
+    """`features(eta, zs) -> [layers, M, width]`: what each layer generator makes of z before its heads. None: it has
+    no such thing."""
 
 
 class GeneratorSpec(NamedTuple):
@@ -107,7 +125,7 @@ def make_spec(example: Params, config: GeneratorConfig) -> GeneratorSpec:
         shapes=tuple(leaf.shape for _, leaf in paths_and_leaves),
         treedef=treedef,
         targets=tuple(_targets(path, leaf, config) for path, leaf in paths_and_leaves),
-        features=MLP(config.hidden[:-1], config.hidden[-1], "relu", "he", "he"),
+        features=MLP(config.hidden[:-1], config.hidden[-1], config.activation, "he", "he"),
         config=config,
     )
 
@@ -125,7 +143,16 @@ def _targets(path: Any, leaf: Array, config: GeneratorConfig) -> tuple[np.ndarra
     return np.zeros(leaf.size, np.float32), std
 
 
-def init_head(config: GeneratorConfig, key: Key, centre: np.ndarray, std: float) -> Array:
+def features_of(spec: GeneratorSpec, params: Params, z: Array) -> Array:
+    """What one layer generator makes of one z `[Z]`, `[width]`."""
+    found = ACTIVATIONS[spec.config.activation](apply(spec.features, params, z))
+    if not spec.config.normalize:
+        return found
+    found = found - jnp.mean(found)
+    return found * jax.lax.rsqrt(jnp.mean(found**2) + 1e-6)
+
+
+def init_head(config: GeneratorConfig, key: Key, features: Array, centre: np.ndarray, std: float) -> Array:
     """What maps a layer's features to one leaf, `[size, width + 1]`: a row for each number of the leaf.
 
     The bias is the last column, that of a feature which is always 1: its gradient is then part of one matrix product. A
@@ -134,17 +161,18 @@ def init_head(config: GeneratorConfig, key: Key, centre: np.ndarray, std: float)
     Args:
         config: its last hidden width is the features'.
         key: consumed.
+        features: of many z, `[N, width]`: their mean and variance decide how far z moves the numbers.
         centre: means that the leaf's numbers start with, `[size]`.
         std: their standard deviation.
     """
     kernel_key, bias_key = jax.random.split(key)
-    # With He's initialisation the features entering the last layer have mean square 1, so their sum over `width`
-    # entries of variance v / width has variance v.
     width, size = config.hidden[-1], centre.size
-    kernel_std = std * math.sqrt((1.0 - config.constant_fraction) / width)
+    mean, spread = jnp.mean(features, axis=0), jnp.sum(jnp.var(features, axis=0))
+    kernel_std = std * jnp.sqrt((1.0 - config.constant_fraction) / spread)
     kernel = kernel_std * jax.random.normal(kernel_key, (size, width))
     constant = std * math.sqrt(config.constant_fraction) * jax.random.normal(bias_key, (size,))
-    return jnp.concatenate([kernel, (centre + constant)[:, None]], axis=1)
+    # Features that are never negative have a mean, and what it comes to is the same for every z.
+    return jnp.concatenate([kernel, (centre + constant - kernel @ mean)[:, None]], axis=1)
 
 
 def init(spec: GeneratorSpec, key: Key) -> Params:
@@ -153,9 +181,15 @@ def init(spec: GeneratorSpec, key: Key) -> Params:
     for name, layer_key in zip(spec.layers, jax.random.split(key, len(spec.layers)), strict=True):
         indices = spec.layers[name]
         features_key, *keys = jax.random.split(layer_key, 1 + len(indices))
-        heads = {str(i): init_head(spec.config, key, *spec.targets[i]) for i, key in zip(indices, keys, strict=True)}
-        features = spec.features.init(features_key, jnp.zeros(spec.config.noise_size))["params"]
-        eta[name] = {"features": features, **heads}
+        params = spec.features.init(features_key, jnp.zeros(spec.config.noise_size))["params"]
+        # Always the same z: that of the networks is drawn from keys of its own.
+        zs = jax.random.normal(jax.random.key(0), (NUM_CALIBRATION, spec.config.noise_size))
+        features = jax.vmap(partial(features_of, spec, params))(zs)
+        heads = {
+            str(i): init_head(spec.config, key, features, *spec.targets[i])
+            for i, key in zip(indices, keys, strict=True)
+        }
+        eta[name] = {"features": params, **heads}
     return eta
 
 
@@ -176,10 +210,26 @@ def generate(spec: GeneratorSpec, eta: Params, z: Array) -> Params:
     generated: list[Array | None] = [None] * len(spec.shapes)
     for number, (name, indices) in enumerate(spec.layers.items()):
         own_z = z if spec.config.noise == "shared" else z[number]
-        inputs = jnp.append(jax.nn.relu(apply(spec.features, eta[name]["features"], own_z)), 1.0)
+        inputs = jnp.append(features_of(spec, eta[name]["features"], own_z), 1.0)
         for i in indices:
             generated[i] = (inputs @ eta[name][str(i)].T).reshape(spec.shapes[i])
     return jax.tree.unflatten(spec.treedef, generated)
+
+
+def features(spec: GeneratorSpec, eta: Params, zs: Array) -> Array:
+    """The features of all layers for all z, `[layers, M, width]`; see `Generator.features`."""
+    shared = spec.config.noise == "shared"
+    return jnp.stack(
+        [
+            jax.vmap(partial(features_of, spec, eta[name]["features"]))(zs if shared else zs[:, number])
+            for number, name in enumerate(spec.layers)
+        ]
+    )
+
+
+def dead_share(features: Array) -> Array:
+    """Share of features `[layers, M, width]` that hardly depend on z: standard deviation over z below `DEAD_STD`."""
+    return jnp.mean(jnp.std(features, axis=1) < DEAD_STD)
 
 
 def make_generator(example: Params, config: GeneratorConfig | None = None) -> Generator:
@@ -213,4 +263,5 @@ def make_generator(example: Params, config: GeneratorConfig | None = None) -> Ge
         sample_noise=partial(sample_noise, spec),
         generate=generate_one,
         sample=jax.vmap(generate_one, in_axes=(None, 0)),
+        features=partial(features, spec),
     )

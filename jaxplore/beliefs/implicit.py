@@ -1,5 +1,6 @@
 """The paper's belief: a generator of dynamics networks, trained by amortised SVGD on the replay."""
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import NamedTuple
@@ -14,6 +15,7 @@ from jaxplore.beliefs.svgd import AmortizedSVGD, SVGDConfig, SVGDState, make_amo
 from jaxplore.dynamics import ENCODINGS, DynamicsConfig, Encoding, Normalizers, Prediction
 from jaxplore.replay import Replay
 from jaxplore.types import Array, Key, Metrics, Params, Transition
+from jaxplore.validate import FieldError
 
 
 class GeneratorBelief(NamedTuple):
@@ -28,6 +30,8 @@ class GeneratorBelief(NamedTuple):
     """`O + A`"""
     batch_size: int
     svgd: SVGDConfig
+    num_generators: int
+    """K, each with its own state along a leading axis where there are several."""
 
 
 def make_generator_belief(
@@ -52,7 +56,7 @@ def make_generator_belief(
         A `Belief` whose models are parameter trees.
 
     Raises:
-        FieldError: a size below 1.
+        FieldError: a size below 1, or a number of generators that does not divide that of the networks.
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -69,27 +73,52 @@ def make_generator_belief(
     network = dynamics.make_network(dynamics_config, obs_size)
     # Only the example's shapes and spread are used; a fixed key keeps the factory pure.
     example = network.init(jax.random.key(0), jnp.zeros(obs_size + action_size))["params"]
-    generator = make_generator(example, generator_config)
-
+    generator_config = generator_config or GeneratorConfig()
+    generator, count = make_generator(example, generator_config), generator_config.num_generators
+    if svgd_config.num_particles % count:
+        allowed = f"a divisor of svgd.num_particles={svgd_config.num_particles}"
+        raise FieldError("num_generators", count, allowed, "shares the networks unequally", "GeneratorConfig")
+    svgd_config = dataclasses.replace(svgd_config, num_particles=svgd_config.num_particles // count)
     apply = functools.partial(_run, network, encoding)
     posterior = make_amortized_svgd(generator, apply, obs_size, make_optimizer(fit_config), svgd_config)
     input_size = obs_size + action_size
-    parts = GeneratorBelief(generator, posterior, apply, encoding, input_size, fit_config.batch_size, svgd_config)
+    parts = GeneratorBelief(
+        generator, posterior, apply, encoding, input_size, fit_config.batch_size, svgd_config, count
+    )
     return Belief(
-        init=posterior.init,
+        init=functools.partial(init, parts),
         update=functools.partial(update, parts),
         sample=functools.partial(sample, parts),
         predict=functools.partial(predict, parts),
         encoding=encoding,
-        num_models=svgd_config.num_particles,
+        num_models=svgd_config.num_particles * count,
         fit_config=fit_config,
     )
+
+
+def init(parts: GeneratorBelief, key: Key) -> SVGDState:
+    """New generators; several along a leading axis `K`."""
+    if parts.num_generators == 1:
+        return parts.posterior.init(key)
+    return jax.vmap(parts.posterior.init)(jax.random.split(key, parts.num_generators))
 
 
 def update(
     parts: GeneratorBelief, key: Key, state: SVGDState, data: Replay[Transition], normalizers: Normalizers
 ) -> tuple[SVGDState, Metrics]:
-    """One step of amortised SVGD on a minibatch of `data`."""
+    """One step of amortised SVGD on a minibatch of `data`, each generator on one of its own; metrics are means."""
+    if parts.num_generators == 1:
+        return update_one(parts, key, state, data, normalizers)
+    keys = jax.random.split(key, parts.num_generators)
+    one = jax.vmap(functools.partial(update_one, parts), in_axes=(0, 0, None, None))
+    state, metrics = one(keys, state, data, normalizers)
+    return state, {name: jnp.mean(values) for name, values in metrics.items()}
+
+
+def update_one(
+    parts: GeneratorBelief, key: Key, state: SVGDState, data: Replay[Transition], normalizers: Normalizers
+) -> tuple[SVGDState, Metrics]:
+    """`update` of one generator."""
     batch_key, extra_key, update_key = jax.random.split(key, 3)
     batch = replay.sample(batch_key, data, parts.batch_size)
     inputs = parts.encoding.inputs(normalizers, batch.obs, batch.action)
@@ -103,8 +132,25 @@ def update(
 
 
 def sample(parts: GeneratorBelief, key: Key, state: SVGDState, num: int) -> Params:
-    """`num` networks, each leaf with a leading axis `M = num`; the particles themselves where their noise is fixed."""
+    """`num` networks, each leaf with a leading axis `M = num`, as many from each generator; the particles themselves
+    where their noise is fixed.
+
+    Raises:
+        FieldError: `num` below 1, or not as many from each generator.
+    """
     validate.at_least("num", num, 1)
+    count = parts.num_generators
+    if count == 1:
+        return sample_one(parts, key, state, num)
+    if num % count:
+        raise FieldError("num", num, f"a multiple of num_generators={count}", "are not as many from each generator")
+    one = jax.vmap(functools.partial(sample_one, parts, num=num // count))
+    networks = one(jax.random.split(key, count), state)
+    return jax.tree.map(lambda leaf: leaf.reshape(num, *leaf.shape[2:]), networks)
+
+
+def sample_one(parts: GeneratorBelief, key: Key, state: SVGDState, num: int) -> Params:
+    """`num` networks of one generator."""
     if parts.svgd.redraw == "fixed" and num == parts.svgd.num_particles:
         return parts.generator.sample(state.eta, state.z)
     return parts.generator.sample(state.eta, parts.generator.sample_noise(key, num))

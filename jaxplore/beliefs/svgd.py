@@ -29,7 +29,7 @@ import optax
 from flax import struct
 
 from jaxplore import validate
-from jaxplore.beliefs.generator import Generator, fan_in
+from jaxplore.beliefs.generator import Generator, dead_share, fan_in
 from jaxplore.types import Array, Key, Metrics, Params
 from jaxplore.validate import Checks, FieldError
 
@@ -377,6 +377,8 @@ def update(
         "likelihood_std": jnp.mean(jnp.sqrt(likelihood_var)),
         "gradient_norm": optax.tree.norm(gradient),
     }
+    if generator.features is not None:
+        metrics["dead_features"] = dead_share(generator.features(state.eta, z))
     eta = optax.apply_updates(state.eta, steps)
     return SVGDState(eta=eta, opt_state=opt_state, likelihood_var=likelihood_var, z=z), metrics
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxplore.beliefs.generator import GeneratorConfig, make_generator
+from jaxplore.beliefs.generator import GeneratorConfig, dead_share, make_generator
 from jaxplore.networks import MLP, count_params
 
 TARGET = MLP(hidden=(48,), output_size=3)
@@ -25,11 +25,6 @@ def draws(config, tree=None, num_inits=128, num_networks=32):
         return generator.sample(generator.init(init_key), generator.sample_noise(noise_key, num_networks))
 
     return jax.tree.map(np.asarray, jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(1), num_inits)))
-
-
-def relu_correlation(rho: float) -> float:
-    """Correlation (about 0) of ReLU features of Gaussians with correlation rho (arc-cosine kernel, Cho & Saul 2009)."""
-    return (math.sqrt(1 - rho**2) + rho * (math.pi - math.acos(rho))) / math.pi
 
 
 @pytest.mark.parametrize(
@@ -52,13 +47,37 @@ def test_sampled_networks_start_with_the_spread_that_the_rule_gives(rule, consta
     for name, std in zip(("dense", "conv"), want, strict=True):
         assert np.std(networks[name]) == pytest.approx(std, rel=0.05)
         assert abs(np.mean(networks[name])) < 0.05 * std
-        # The share that z moves, E[Var_z] / total: features of unrelated z are correlated by relu_correlation twice,
-        # 0.494, so that z moves 0.506 of what constant_fraction leaves it.
-        moved = (1 - constant_fraction) * (1 - relu_correlation(relu_correlation(0.0)))
+        # The share that z moves, E[Var_z] / total, is what constant_fraction leaves it.
         share = np.mean(np.var(networks[name], axis=1, ddof=1)) / np.mean(networks[name] ** 2)
-        assert share == pytest.approx(moved, rel=0.05)
+        assert share == pytest.approx(1 - constant_fraction, rel=0.05)
     assert np.mean(networks["scale"]) == pytest.approx(1.0, abs=0.02)
     assert np.std(networks["scale"]) == pytest.approx(0.2, rel=0.05)
+
+
+@pytest.mark.parametrize("activation", ["relu", "leaky_relu", "tanh", "swish"])
+@pytest.mark.parametrize("normalize", [False, True])
+def test_the_share_is_what_it_says_with_any_features(activation, normalize):
+    config = GeneratorConfig(hidden=(64,), constant_fraction=0.3, activation=activation, normalize=normalize)
+    kernel = draws(config, {"dense": np.full((20, 30), 0.5, np.float32)})["dense"]
+    assert np.std(kernel) == pytest.approx(0.5, rel=0.05)
+    share = np.mean(np.var(kernel, axis=1, ddof=1)) / np.mean(kernel**2)
+    assert share == pytest.approx(0.7, rel=0.05)
+
+
+def test_features_that_are_the_same_for_every_z_are_counted():
+    # two layers of three features: one is cut off for every z, one hardly moves
+    tree = {"a": {"kernel": np.ones((2, 3), np.float32)}, "b": {"kernel": np.ones((2, 3), np.float32)}}
+    generator = make_generator(tree, GeneratorConfig(noise_size=4, hidden=(3,)))
+    eta = jax.tree.map(np.array, generator.init(jax.random.key(0)))
+    eta["a"]["features"]["output"]["bias"][:] = (-1e3, 1e3, 1e3)
+    eta["b"]["features"]["output"]["bias"][:] = 1e3
+    eta["b"]["features"]["output"]["kernel"][:, 2] = 1e-6
+    zs = generator.sample_noise(jax.random.key(1), 512)
+    assert generator.features is not None
+    found = np.asarray(generator.features(eta, zs))
+    assert found.shape == (2, 512, 3)
+    assert np.all(found[0, :, 0] == 0)
+    assert float(dead_share(found)) == pytest.approx(2 / 6)
 
 
 def test_networks_of_an_mlp_start_like_the_mlp():
