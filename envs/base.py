@@ -64,9 +64,11 @@ class EnvSpec:
 
     def __post_init__(self) -> None:
         checks = Checks(self)
+        if not isinstance(self.name, str) or not self.name:
+            raise checks.refusal("name", "names nothing", "a name")
         for field in ("obs_names", "action_names"):
             names = getattr(self, field)
-            if isinstance(names, str) or not names or not all(isinstance(name, str) for name in names):
+            if isinstance(names, str) or not names or not all(isinstance(name, str) and name for name in names):
                 raise checks.refusal(field, "names nothing", "one or more names")
         checks.at_least("episode_steps", 1)
         checks.in_range("dt", 0.0, open_low=True)

@@ -230,37 +230,63 @@ def make_stepper(env: Environment, capacity: int, act: ActAs) -> Stepper:
 def _checked(env: Environment) -> Environment:
     """The same environment; what its functions raise, and shapes that are not its spec's, come as `EnvironmentFault`.
 
-    On the device that happens when it is traced, and costs nothing when it is run.
+    On the device that happens when it is traced, and costs nothing when it is run. On the host, so do numbers that are
+    not finite where nothing has diverged: at a reset, or as the reward of a step that is well.
     """
-    name, obs_shape = env.spec.name, (env.spec.obs_size,)
-
-    def check_obs(when: str, obs: Any) -> None:
-        if jnp.shape(obs) != obs_shape:
-            expected = f"shape {obs_shape}, an entry for each of the spec's obs_names"
-            raise EnvironmentFault(name, when, f"returned an observation of {shape_of(obs)}", expected)
-
-    def call(when: str, expected: str, function: Callable[..., Any], *args: Any) -> Any:
-        try:
-            return function(*args)
-        except (EnvironmentFault, FieldError):
-            raise
-        except Exception as error:  # A function of anybody's raises anything.
-            raise EnvironmentFault(name, when, raised(error), expected) from error
-
-    def reset(key: Key) -> EnvState:
-        state = call("reset", "an EnvState", env.reset, key)
-        check_obs("reset", state.obs)
-        return state
-
-    def step(state: EnvState, action: Array) -> tuple[EnvState, Transition]:
-        found = call("step", "an EnvState and a Transition", env.step, state, action)
-        if not isinstance(found, tuple) or len(found) != 2:
-            what = f"{len(found)} values" if isinstance(found, tuple) else type(found).__name__
-            raise EnvironmentFault(name, "step", f"returned {what}", "an EnvState and a Transition")
-        check_obs("step", found[1].next_obs)
-        return found
-
+    reset, step = (functools.partial(function, env) for function in (_checked_reset, _checked_step))
     return dataclasses.replace(env, reset=reset, step=step)
+
+
+def _checked_reset(env: Environment, key: Key) -> EnvState:
+    state = _call(env, "reset", "an EnvState", env.reset, key)
+    _check_shape(env, "reset", "an observation", getattr(state, "obs", None), env.spec.obs_size)
+    if not env.compiled and not np.isfinite(jax.device_get(state.obs)).all():
+        what = "returned an observation with numbers that are not finite"
+        raise EnvironmentFault(env.spec.name, "reset", what, "finite numbers")
+    return state
+
+
+def _checked_step(env: Environment, state: EnvState, action: Array) -> tuple[EnvState, Transition]:
+    expected = "an EnvState and a Transition"
+    found = _call(env, "step", expected, env.step, state, action)
+    if not isinstance(found, tuple) or len(found) != 2:
+        what = f"{len(found)} values" if isinstance(found, tuple) else type(found).__name__
+        raise EnvironmentFault(env.spec.name, "step", f"returned {what}", expected)
+    after, transition = found
+    if not isinstance(transition, Transition):
+        what = f"{type(after).__name__} and {type(transition).__name__}"
+        raise EnvironmentFault(env.spec.name, "step", f"returned {what}", expected)
+    _check_shape(env, "step", "an observation", transition.next_obs, env.spec.obs_size)
+    for name in ("reward", "terminated", "truncated"):
+        _check_shape(env, "step", f"`{name}`", getattr(transition, name))
+    if not env.compiled:
+        _check_reward(env, transition)
+    return after, transition
+
+
+def _call(env: Environment, when: str, expected: str, function: Callable[..., Any], *args: Any) -> Any:
+    try:
+        return function(*args)
+    except (EnvironmentFault, FieldError):
+        raise
+    except Exception as error:  # A function of anybody's raises anything.
+        raise EnvironmentFault(env.spec.name, when, raised(error), expected) from error
+
+
+def _check_shape(env: Environment, when: str, what: str, value: Any, *shape: int) -> None:
+    if np.shape(value) != shape:
+        entries = "an entry for each of the spec's obs_names" if shape else "one number"
+        expected = f"shape {shape}, {entries}"
+        raise EnvironmentFault(env.spec.name, when, f"returned {what} of {shape_of(value)}", expected)
+
+
+def _check_reward(env: Environment, transition: Transition) -> None:
+    # device_get: NumPy itself would wait for an array with Python's lock held, and hang.
+    reward = jax.device_get(transition.reward)
+    if np.isfinite(reward) or jax.device_get(transition.terminated):
+        return
+    if np.isfinite(jax.device_get(transition.next_obs)).all():
+        raise EnvironmentFault(env.spec.name, "step", f"returned the reward {float(reward)}", "a finite number")
 
 
 def _collect_on_device(

@@ -13,7 +13,7 @@ from typing import Any
 
 import jax
 
-from envs.adapters import brax_like
+from envs.adapters import brax_like, check_known
 from envs.base import Environment
 from envs.errors import raised
 from jaxplore import validate
@@ -47,7 +47,7 @@ def load() -> ModuleType:
 
 def check_name(name: str) -> None:
     """Raise `FieldError` unless Brax has an environment of this name, and is there."""
-    validate.one_of("env", f"brax:{name}", (f"brax:{known}" for known in load()._envs))
+    check_known("brax", name, load()._envs)
 
 
 def make_environment(

@@ -1,4 +1,4 @@
-"""Any Gymnasium environment: `make("gymnasium:Pendulum-v1")`; `"gymnasium:package:Own-v0"` imports a package first.
+"""Any Gymnasium environment: `make("gymnasium:Pendulum-v1")`, or `"gymnasium:module:Own-v0"` of an imported module.
 
 A live Gymnasium environment cannot be saved. So a state is what leads to it: the seed of the episode's reset, drawn
 from the key, and the actions since. The live environments are a cache: one that is not where a state says is reset with
@@ -16,7 +16,6 @@ environment depends on its seed and its actions alone; one that does not is foun
 # pyright: reportArgumentType=false, reportReturnType=false, reportAttributeAccessIssue=false
 # NumPy arrays stand where the contract says Array, and mujoco ships no stubs.
 
-import difflib
 import functools
 import numbers
 import sys
@@ -31,6 +30,7 @@ from gymnasium import spaces
 from gymnasium.envs.registration import registry
 from gymnasium.vector import AutoresetMode
 
+from envs.adapters import check_known
 from envs.base import Environment, EnvSpec, EnvState, View, check_noise
 from envs.coverage import make_generic_coverage
 from envs.errors import EnvironmentFault, raised, shape_of
@@ -43,8 +43,6 @@ EPISODE_STEPS = 1_000
 """Where an environment is registered without a time limit."""
 LARGEST = 1e18
 """Size of an observation beyond which physics is taken to have diverged: its square is no float32."""
-NEIGHBOURS = 5
-"""Ids that are named where one is not known."""
 
 
 @struct.dataclass
@@ -67,10 +65,7 @@ def check_name(name: str) -> None:
     if colon and module not in sys.modules:
         problem = f"needs the module {module!r}, which has not been imported"
         raise FieldError("env", f"gymnasium:{name}", f"with --import={module}, or after `import {module}`", problem)
-    if env_id not in registry:
-        close = [f"gymnasium:{near}" for near in difflib.get_close_matches(env_id, registry, n=NEIGHBOURS, cutoff=0.0)]
-        allowed = f"an id that Gymnasium knows; the nearest are {', '.join(close)}"
-        raise FieldError("env", f"gymnasium:{name}", allowed, f"is not known. Did you mean {close[0]!r}?")
+    check_known(f"gymnasium{colon}{module}", env_id, registry)
 
 
 class Adapted(NamedTuple):
@@ -329,9 +324,11 @@ class Checked(gymnasium.Wrapper):
         expected = "an observation and a dictionary"
         found = self._call(expected, functools.partial(self.env.reset, seed=seed, options=options))
         self._check_count(found, 2, expected)
-        obs = self._check_obs(found[0])
-        if not np.isfinite(obs).all():
-            raise self._fault("returned an observation with numbers that are not finite", "finite numbers")
+        largest = self._check_obs(found[0])
+        if not largest <= LARGEST:
+            what = f"as large as {largest:g}" if np.isfinite(largest) else "that are not finite"
+            expected = f"numbers between -{LARGEST:g} and {LARGEST:g}"
+            raise self._fault(f"returned an observation with numbers {what}", expected)
         return found
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
@@ -340,15 +337,20 @@ class Checked(gymnasium.Wrapper):
         expected = "an observation, a reward, terminated, truncated and a dictionary"
         found = self._call(expected, functools.partial(self.env.step, action))
         self._check_count(found, 5, expected)
-        obs = self._check_obs(found[0])
+        obs, reward, terminated, truncated, info = found
+        usable = self._check_obs(obs) <= LARGEST
         try:
-            reward = float(np.asarray(found[1]).item())
+            reward = float(np.asarray(reward).item())
         except (TypeError, ValueError) as error:
-            raise self._fault(f"returned a reward of {shape_of(found[1])}", "one number") from error
+            raise self._fault(f"returned a reward of {shape_of(reward)}", "one number") from error
         # Physics that diverges is dropped, the reward with it; without that, somebody would learn from it.
-        if np.isfinite(obs).all() and not abs(reward) <= LARGEST:
+        if usable and not abs(reward) <= LARGEST:
             raise self._fault(f"returned the reward {reward}", f"a number between -{LARGEST:g} and {LARGEST:g}")
-        return found
+        try:
+            return obs, reward, bool(terminated), bool(truncated), info
+        except ValueError as error:
+            what = f"returned terminated and truncated of {shape_of(terminated)} and {shape_of(truncated)}"
+            raise self._fault(what, "True or False") from error
 
     def _call(self, expected: str, function: Callable[[], Any]) -> Any:
         try:
@@ -360,25 +362,32 @@ class Checked(gymnasium.Wrapper):
         if not isinstance(found, tuple) or len(found) != count:
             what = f"{len(found)} values" if isinstance(found, tuple) else type(found).__name__
             raise self._fault(f"returned {what}", expected)
+        if not isinstance(found[-1], dict):
+            raise self._fault(f"returned {type(found[-1]).__name__} for the dictionary", expected)
 
-    def _check_obs(self, obs: Any) -> np.ndarray:
+    def _check_obs(self, obs: Any) -> float:
+        """The size of an observation's largest entry, NaN if there is one. It has its space's shape."""
         space = self.env.observation_space
         if isinstance(space, spaces.Discrete):
             if not space.contains(obs):
                 raise self._fault(f"returned the observation {obs!r}", f"one of {space}")
-            return np.zeros(0)
+            return 1.0
         parts = dict(space.spaces) if isinstance(space, spaces.Dict) else {"": space}
         if isinstance(space, spaces.Dict) and (not isinstance(obs, dict) or set(obs) != set(parts)):
-            names = ", ".join(obs) if isinstance(obs, dict) else type(obs).__name__
+            names = ", ".join(map(str, obs)) if isinstance(obs, dict) else type(obs).__name__
             raise self._fault(f"returned the observation {names}", f"a dictionary with {', '.join(parts)}")
-        found = []
-        for name, part in parts.items():
-            own = obs[name] if name else obs
-            if np.shape(np.asarray(own)) != part.shape:
-                what = f"an observation {f'{name} ' if name else ''}of {shape_of(np.asarray(own))}"
-                raise self._fault(f"returned {what}", f"shape {part.shape}, as its space says")
-            found.append(np.asarray(own, float).ravel())
-        return np.concatenate(found)
+        sizes = [self._check_part(name, part, obs[name] if name else obs) for name, part in parts.items()]
+        return float(np.max(sizes, initial=0.0))
+
+    def _check_part(self, name: str, space: spaces.Space, part: Any) -> float:
+        expected, own = f"shape {space.shape}, as its space says", f"{name} " if name else ""
+        try:
+            entries = np.asarray(part, float)
+        except (TypeError, ValueError) as error:
+            raise self._fault(f"returned an observation {own}that is no array of numbers", expected) from error
+        if entries.shape != space.shape:
+            raise self._fault(f"returned an observation {own}of {shape_of(entries)}", expected)
+        return np.abs(entries).max(initial=0.0)
 
     def _fault(self, found: str, expected: str) -> EnvironmentFault:
         return EnvironmentFault(

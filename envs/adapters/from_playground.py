@@ -10,7 +10,7 @@ import functools
 import warnings
 from typing import Any
 
-from envs.adapters import brax_like
+from envs.adapters import brax_like, check_known
 from envs.base import Environment
 from jaxplore import validate
 from jaxplore.validate import FieldError
@@ -33,7 +33,7 @@ def load() -> Any:
 
 def check_name(name: str) -> None:
     """Raise `FieldError` unless Playground has an environment of this name, and is there."""
-    validate.one_of("env", f"playground:{name}", (f"playground:{known}" for known in load().ALL_ENVS))
+    check_known("playground", name, load().ALL_ENVS)
 
 
 def make_environment(

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from envs.errors import EnvironmentFault
 from envs.stepper import make_collect, make_collect_all, make_stepper, make_walk, prepared
 
 BACKENDS = ["mujoco", "mjx"]
@@ -258,3 +259,57 @@ def test_a_prepared_environment_is_the_same_but_compiled(make_bead):
     after, transition = ready.step(state, jnp.ones(1))
     np.testing.assert_allclose(transition.next_obs, host.step(host.reset(jax.random.key(0)), np.ones(1))[1].next_obs)
     assert after.num_steps == 1
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        (
+            "nan at reset",
+            r"returned an observation with numbers that are not finite at reset\. Expected: finite",
+        ),
+        (
+            "nothing at reset",
+            r"returned an observation of type NoneType at reset\. Expected: shape \(2,\), an",
+        ),
+        ("nan reward", r"returned the reward nan at step\. Expected: a finite number"),
+        ("two rewards", r"returned `reward` of shape \(2,\) at step\. Expected: shape \(\), one number"),
+        ("a tuple", r"returned EnvState and tuple at step\. Expected: an EnvState and a Transition"),
+        ("raises", r"raised KeyError: 'wind' at step\. Expected: an EnvState and a Transition"),
+    ],
+)
+def test_what_an_environment_on_the_host_does_wrong_is_said_in_a_line(make_bead, how, message):
+    bead = make_bead("mujoco")
+
+    def reset(key):
+        state = bead.reset(key)
+        return {"nan at reset": state.replace(obs=state.obs * np.nan), "nothing at reset": None}.get(how, state)
+
+    def step(state, action):
+        after, transition = bead.step(state, action)
+        match how:
+            case "nan reward":
+                transition = transition._replace(reward=np.float32(np.nan))
+            case "two rewards":
+                transition = transition._replace(reward=np.zeros(2, np.float32))
+            case "a tuple":
+                transition = tuple(transition)
+            case "raises":
+                raise KeyError("wind")
+        return after, transition
+
+    stepper = make_stepper(dataclasses.replace(bead, reset=reset, step=step), ROWS, pushed)
+    with pytest.raises(EnvironmentFault, match="the environment bead " + message):
+        stepper.collect(seeds(0), stepper.init(seeds(1)), ACTORS, 3)
+
+
+def test_on_the_host_the_reward_of_a_step_that_diverged_is_nobodys_fault(make_bead):
+    bead = make_bead("mujoco")
+
+    def step(state, action):
+        after, transition = bead.step(state, action)
+        return after, transition._replace(reward=np.float32(np.nan), terminated=np.bool_(True))
+
+    stepper = make_stepper(dataclasses.replace(bead, step=step), ROWS, pushed)
+    _, _, valid = stepper.collect(seeds(0), stepper.init(seeds(1)), ACTORS, 3)
+    assert not valid.any()

@@ -1,3 +1,6 @@
+import importlib
+import sys
+
 import gymnasium
 import jax
 import numpy as np
@@ -198,6 +201,24 @@ def test_an_environment_that_does_not_repeat_itself_is_found_out():
         walk(env, env.reset(jax.random.key(0)), actions_for(env, 3))
 
 
+class Drifting(Toy):
+    """Begins as its seed says, and goes on as it likes."""
+
+    def step(self, action):
+        obs, *rest = super().step(action)
+        return {**obs, "others": obs["others"] + np.random.default_rng().uniform()}, *rest
+
+
+gymnasium.register("jaxplore_test/Drifting-v0", Drifting)
+
+
+def test_a_state_of_chance_is_not_taken_up_by_another_process():
+    first, second = (envs.make("gymnasium:jaxplore_test/Drifting-v0") for _ in range(2))
+    states, _ = walk(first, first.reset(jax.random.key(0)), actions_for(first, 4))
+    with pytest.raises(EnvironmentFault, match=r"so it cannot be resumed, at its second time there\. Expected: an env"):
+        second.step(states[3], np.zeros(2))
+
+
 class Faulty(Toy):
     """Does as told at its third step, or at its reset."""
 
@@ -210,7 +231,8 @@ class Faulty(Toy):
             raise KeyError("lost")
         if self.how == "three values from reset":
             return obs, info, None  # pyright: ignore[reportReturnType]
-        return {**obs, "others": obs["others"] * (np.nan if self.how == "reset is nan" else 1.0)}, info
+        scale = {"reset is nan": np.nan, "reset is huge": 3e38}.get(self.how, 1.0)
+        return {**obs, "others": np.ones(2) * scale}, info
 
     def step(self, action):
         found = super().step(action)
@@ -225,6 +247,14 @@ class Faulty(Toy):
                 return found[:4]
             case "shape":
                 return ({**obs, "counts": np.zeros(3, np.float32)}, reward, *rest)
+            case "ragged":
+                return ({**obs, "counts": [[1.0], [2.0, 3.0]]}, reward, *rest)
+            case "nothing":
+                return (None, reward, *rest)
+            case "two ends":
+                return (obs, reward, np.zeros(2, bool), *rest[1:])
+            case "no dictionary":
+                return (obs, reward, *rest[:2], None)
             case "lacks a part":
                 return ({"counts": obs["counts"]}, reward, *rest)
             case "nan reward":
@@ -246,9 +276,18 @@ gymnasium.register("jaxplore_test/Faulty-v0", Faulty)
         ("reset raises", 0, r"raised KeyError: 'lost' at reset\. Expected: an observation and a dictionary\.$"),
         ("three values from reset", 0, r"returned 3 values at reset\. Expected: an observation and a dictionary\.$"),
         ("reset is nan", 0, r"returned an observation with numbers that are not finite at reset\."),
+        (
+            "reset is huge",
+            0,
+            r"returned an observation with numbers as large as 3e\+38 at reset\. .*between -1e\+18 and ",
+        ),
         ("raises", 3, r"raised RuntimeError: the motor at step 3 of an episode\. Expected: an observation, a reward, "),
         ("four values", 3, r"returned 4 values at step 3 .*Expected: an observation, a reward, terminated, truncated"),
         ("shape", 3, r"returned an observation counts of shape \(3,\) at step 3 .*Expected: shape \(2,\)"),
+        ("ragged", 3, r"returned an observation counts that is no array of numbers at step 3 .*Expected: shape \(2,\)"),
+        ("nothing", 3, r"returned the observation NoneType at step 3 .*Expected: a dictionary with counts, others"),
+        ("two ends", 3, r"returned terminated and truncated of shape \(2,\) and .* at step 3 .*: True or False"),
+        ("no dictionary", 3, r"returned NoneType for the dictionary at step 3 .*Expected: an observation, a reward"),
         ("lacks a part", 3, r"returned the observation counts at step 3 .*Expected: a dictionary with counts, others"),
         ("nan reward", 3, r"returned the reward nan at step 3 .*Expected: a number between -1e\+18 and 1e\+18"),
         ("huge reward", 3, r"returned the reward 3e\+38 at step 3"),
@@ -322,6 +361,12 @@ def test_a_state_that_is_not_finite_ends_the_episode():
             r"env='gymnasium:Pendulum-v9' is not known\. Did you mean 'gymnasium:Pendulum-v1'\? Allowed: .* nearest "
             r"are (gymnasium:\S+, ){4}gymnasium:\S+\.$",
         ),
+        ("gymnasium:?", {}, r"env='gymnasium:\?' is not known\. Allowed: a name that is known; the nearest are gym"),
+        (
+            "gymnasium:gymnasium:Pendulun-v1",
+            {},
+            r"env='gymnasium:gymnasium:Pendulun-v1' is not known\. Did you mean 'gymnasium:gymnasium:Pendulum-v1'\?",
+        ),
         (
             "gymnasium:nowhere:Own-v0",
             {},
@@ -357,6 +402,23 @@ def test_refuses_what_it_cannot_do_and_says_what_it_can(name, options, message):
         gymnasium.register(f"jaxplore_test/{kind.__name__}-v0", kind)
     with pytest.raises(ValueError, match=message):
         envs.make(name, **options)
+
+
+def test_a_name_imports_nothing(tmp_path, monkeypatch):
+    (tmp_path / "jaxplore_own.py").write_text(
+        "import gymnasium, tests.envs.adapters.test_from_gymnasium as here\n"
+        "gymnasium.register('jaxplore_test/Own-v0', here.Toy)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    name = "gymnasium:jaxplore_own:jaxplore_test/Own-v0"
+    for refused in (envs.check_name, envs.make):
+        with pytest.raises(ValueError, match=r"needs the module 'jaxplore_own', which has not been imported"):
+            refused(name)
+    assert "jaxplore_own" not in sys.modules
+    importlib.import_module("jaxplore_own")
+    assert envs.make(name).spec.name == name
+    monkeypatch.delitem(sys.modules, "jaxplore_own")
+    gymnasium.registry.pop("jaxplore_test/Own-v0")
 
 
 def test_refuses_bad_actions():
