@@ -1,10 +1,22 @@
 """Our environments as Gymnasium environments: `import envs`, then `gymnasium.make("jaxplore/AntMaze-v0")`.
 
+Where jaxplore is installed from its wheel, without the import.
+
 Every one in `envs.FACTORIES` is registered, under its name in camel case. Keyword arguments of `gymnasium.make` go to
 the factory: `gymnasium.make("jaxplore/AntMaze-v0", backend="mujoco", obs_noise=0.02)`.
+
+Several in processes of their own, which have to be spawned, as a fork has none of JAX's threads:
+
+    gymnasium.make_vec(
+        "jaxplore/AntMaze-v0", num_envs=4, vectorization_mode="async", vector_kwargs={"context": "spawn"}
+    )
+
+Spawning imports the script again, so its own work goes below `if __name__ == "__main__":`. Without the context, where
+Python forks by default, the first `reset` raises an error that says so.
 """
 
 import functools
+import os
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -13,13 +25,17 @@ import jax
 import numpy as np
 from gymnasium import spaces
 
-from envs.base import EnvState
+from envs.base import Environment, EnvState
 from envs.stepper import prepared
 from jaxplore import validate
 
 NAMESPACE, VERSION = "jaxplore", 0
 SPELLINGS = {"nchain": "NChain"}
 """Names whose camel case is not that of their words."""
+FORKED = (
+    "this process was forked from one that runs JAX, whose threads it lacks: it could wait forever. Allowed: processes "
+    "that are spawned, such as gymnasium.make_vec's with vector_kwargs={'context': 'spawn'}."
+)
 
 
 class GymnasiumEnv(gymnasium.Env):
@@ -38,6 +54,8 @@ class GymnasiumEnv(gymnasium.Env):
 
     Raises:
         FieldError: an unknown name, option or render mode, or a value that the factory refuses.
+        RuntimeError: in a process that was forked from one with environments: from `reset`, so that Gymnasium's vector
+            environments hand it on, or at once where there is none like it over there.
 
     Example:
         >>> env = GymnasiumEnv("acrobot")
@@ -46,13 +64,12 @@ class GymnasiumEnv(gymnasium.Env):
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"]}  # noqa: RUF012  (as Gymnasium has it)
+    _latest: tuple[str, Environment] | None = None
 
     def __init__(
         self, name: str, *, render_mode: str | None = None, height: int = 480, width: int = 480, **options: Any
     ) -> None:
-        import envs
-
-        self._env = prepared(envs.make(name, **options))
+        self._env = self._make(name, options)
         spec, view = self._env.spec, self._env.view
         modes = ["rgb_array"] if view else []
         if render_mode is not None:
@@ -75,6 +92,8 @@ class GymnasiumEnv(gymnasium.Env):
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; see `gymnasium.Env.reset`. There are no `options`."""
+        if _is_forked():
+            raise RuntimeError(FORKED)
         super().reset(seed=seed)
         state = self._env.reset(jax.random.key(int(self.np_random.integers(2**31))))
         self._state = state
@@ -120,6 +139,18 @@ class GymnasiumEnv(gymnasium.Env):
             self._frames.close()  # pyright: ignore[reportAttributeAccessIssue]
             self._frames = None
 
+    @staticmethod
+    def _make(name: str, options: dict[str, Any]) -> Environment:
+        """The environment, or in a fork, where nothing can be made, the latest one of before, to read its spec."""
+        import envs
+
+        call = repr((name, sorted(options.items())))
+        if not _is_forked():
+            GymnasiumEnv._latest = call, prepared(envs.make(name, **options))
+        elif GymnasiumEnv._latest is None or GymnasiumEnv._latest[0] != call:
+            raise RuntimeError(FORKED)
+        return GymnasiumEnv._latest[1]
+
     def _present(self) -> Iterable[EnvState]:
         while True:
             assert self._state is not None
@@ -131,6 +162,16 @@ class GymnasiumEnv(gymnasium.Env):
         return (np.int64(np.argmax(obs)) if self._env.spec.one_hot_obs else np.array(obs, np.float32)), info
 
 
+@functools.cache
+def _first_process() -> int:
+    """The process that made the first environment; a fork inherits the answer."""
+    return os.getpid()
+
+
+def _is_forked() -> bool:
+    return _first_process() != os.getpid()
+
+
 def gymnasium_id(name: str) -> str:
     """The id of one of `envs.FACTORIES`: `jaxplore/AntMaze-v0` for `ant_maze`."""
     spelling = SPELLINGS.get(name) or "".join(word.capitalize() for word in name.split("_"))
@@ -138,6 +179,7 @@ def gymnasium_id(name: str) -> str:
 
 
 def register(names: Iterable[str]) -> None:
-    """Register environments with Gymnasium, as `gymnasium_id` spells them."""
+    """Register environments with Gymnasium, as `gymnasium_id` spells them; one that it knows stays as it is."""
     for name in names:
-        gymnasium.register(gymnasium_id(name), functools.partial(GymnasiumEnv, name))
+        if gymnasium_id(name) not in gymnasium.registry:
+            gymnasium.register(gymnasium_id(name), f"{__name__}:GymnasiumEnv", kwargs={"name": name})

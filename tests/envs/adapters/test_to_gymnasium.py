@@ -71,6 +71,32 @@ def test_a_seed_gives_the_episode_again_and_the_steps_are_the_environments_own()
     assert not np.array_equal(env.reset()[0], env.reset()[0])
 
 
+def make_async(context, **options):
+    """Two chains in processes of their own, which start as `context` says."""
+    return gymnasium.make_vec(
+        "jaxplore/NChain-v0", 2, vectorization_mode="async", vector_kwargs={"context": context}, **options
+    )
+
+
+@pytest.mark.filterwarnings("ignore")  # JAX's own of the fork, and what Gymnasium says of a worker that fails.
+def test_a_forked_process_is_refused_and_does_not_hang():
+    vector = make_async("fork")
+    with pytest.raises(RuntimeError, match=r"forked from one that runs JAX.*Allowed: .*{'context': 'spawn'}\.$"):
+        vector.reset(seed=0)
+    vector.close(terminate=True)
+
+
+@pytest.mark.slow
+def test_spawned_processes_give_the_numbers_of_this_one():
+    vectors = make_async("spawn"), gymnasium.make_vec("jaxplore/NChain-v0", 2, vectorization_mode="sync")
+    vectors[0].action_space.seed(0)
+    actions = [vectors[0].action_space.sample() for _ in range(10)]
+    walks = [[vector.reset(seed=3)[0], *(vector.step(action)[0] for action in actions)] for vector in vectors]
+    np.testing.assert_array_equal(*walks)
+    for vector in vectors:
+        vector.close()
+
+
 def make_counter(backend="auto", obs_noise=0.0):
     """Two choices, one of which counts up; ends at 3, is cut after 4 steps; a picture as bright as the count."""
     import jax.numpy as jnp
