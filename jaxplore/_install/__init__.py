@@ -1,0 +1,1 @@
+"""How jaxplore is installed. Of these files only `startup.py` is in the wheel, by another name."""
