@@ -57,6 +57,7 @@ from jaxplore.learners import (
     make_sac,
 )
 from jaxplore.methods import METHODS, Method, get_method
+from jaxplore.policies import load_policy
 from jaxplore.replay import Replay
 from jaxplore.signals import RND, Reward, RNDConfig, make_rnd, rewards
 from jaxplore.types import Transition
@@ -105,6 +106,7 @@ __all__ = [
     "World",
     "dynamics",
     "get_method",
+    "load_policy",
     "make_amortized_svgd",
     "make_ddpg",
     "make_ddqn",
