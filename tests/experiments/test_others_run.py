@@ -21,14 +21,17 @@ PLAYGROUND = (
 )
 MUJOCO = ("Ant", "HalfCheetah", "Hopper", "Humanoid", "HumanoidStandup", "InvertedDoublePendulum", "InvertedPendulum")
 MUJOCO = (*MUJOCO, "Pusher", "Reacher", "Swimmer", "Walker2d")
+BOX2D = ("BipedalWalker-v3", "CarRacing-v3", "LunarLander-v3", "LunarLanderContinuous-v3")
 GYMNASIUM = (
     *("Acrobot-v1", "CartPole-v0", "CartPole-v1", "MountainCar-v0", "MountainCarContinuous-v0", "Pendulum-v1"),
-    *("Blackjack-v1", "CliffWalking-v1", "CliffWalkingSlippery-v1", "FrozenLake-v1", "FrozenLake8x8-v1", "Taxi-v3"),
+    *("Blackjack-v1", "CliffWalking-v1", "CliffWalkingSlippery-v1", "FrozenLake-v1", "FrozenLake8x8-v1", "Taxi-v4"),
     *(f"{name}-v{version}" for name in MUJOCO for version in (4, 5)),
-    *("BipedalWalker-v3", "CarRacing-v3", "LunarLander-v3", "LunarLanderContinuous-v3"),
+    *BOX2D,
     *("phys2d/CartPole-v1", "phys2d/Pendulum-v0", "tabular/Blackjack-v0", "tabular/CliffWalking-v0"),
 )
-REFUSED = ("cannot be made here", "has observations", "has actions", "does not fit", "needs", "is not known")
+MAY_BE_REFUSED = ("Blackjack-v1", "Pusher-v4", *BOX2D)
+"""A tuple for observations, an old MuJoCo, pictures, and a package that may not be there."""
+REFUSED = ("cannot be made here", "has observations", "has actions", "does not fit", "needs", "acts by numbers")
 
 
 def outcome(name: str, out: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]) -> str:
@@ -47,10 +50,15 @@ def outcome(name: str, out: Path, capsys: pytest.CaptureFixture[str], words: tup
     return line
 
 
+def show(name: str, found: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with capsys.disabled():
+        print(f"\n{name:<36} {found}", end=" ")
+
+
 @pytest.mark.parametrize("name", BRAX)
 def test_brax(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     found = outcome(f"brax:{name}", tmp_path / "run", capsys, TINY)
-    print(f"brax:{name:<30} {found}")
+    show(f"brax:{name}", found, capsys)
     assert "cells" in found
 
 
@@ -58,19 +66,20 @@ def test_brax(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
 def test_playground(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     pytest.importorskip("mujoco_playground")
     found = outcome(f"playground:{name}", tmp_path / "run", capsys, TINY)
-    print(f"playground:{name:<24} {found}")
+    show(f"playground:{name}", found, capsys)
     assert "cells" in found
 
 
-def test_gymnasium(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert len(GYMNASIUM) >= 40
-    table = {}
-    for name in GYMNASIUM:
-        words = tiny_flags("random") if name not in gymnasium.registry else TINY
-        table[name] = outcome(f"gymnasium:{name}", tmp_path / name.replace("/", "-"), capsys, words)
-        if "implicit" in table[name]:
-            # no belief fits it: uniform actions do
-            table[name] = outcome(f"gymnasium:{name}", tmp_path / name.replace("/", "-"), capsys, tiny_flags("random"))
-    with capsys.disabled():
-        print("", *(f"gymnasium:{name:<28} {found}" for name, found in table.items()), sep="\n")
-    assert sum("cells" in found for found in table.values()) >= 25
+def test_there_are_enough_of_gymnasium():
+    assert len({name for name in GYMNASIUM if name in gymnasium.registry}) >= 40
+
+
+@pytest.mark.filterwarnings("ignore:.* is out of date:DeprecationWarning")
+@pytest.mark.parametrize("name", GYMNASIUM)
+def test_gymnasium(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    found = outcome(f"gymnasium:{name}", tmp_path / "run", capsys, TINY)
+    if "such as random" in found:
+        # No belief fits it: uniform actions do.
+        found = outcome(f"gymnasium:{name}", tmp_path / "run", capsys, ("--method=random", *tiny_flags("random")))
+    show(f"gymnasium:{name}", found, capsys)
+    assert "cells" in found or name in MAY_BE_REFUSED
