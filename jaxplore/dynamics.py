@@ -100,11 +100,10 @@ def update_normalizers(state: Normalizers, transitions: Transition, valid: Array
 
 def model_inputs(state: Normalizers, obs: Array, action: Array) -> Array:
     """What a network sees: `obs [..., O]`, `action [..., A]` -> `[..., O + A]`, normalised."""
-    free = normalizer.normalize(state.action, action, limit=None)
-    limited = jnp.clip(free, -normalizer.LIMIT, normalizer.LIMIT)
     # A choice that was never taken is far away, too; but a policy that climbs a gradient needs the action's everywhere.
-    seen = free + jax.lax.stop_gradient(limited - free)
-    return jnp.concatenate([normalizer.normalize(state.obs, obs), seen], axis=-1)
+    near = action + jax.lax.stop_gradient(normalizer.clip(state.action, action) - action)
+    inputs = [normalizer.normalize(state.obs, obs), normalizer.normalize(state.action, near, limit=None)]
+    return jnp.concatenate(inputs, axis=-1)
 
 
 def model_targets(state: Normalizers, obs: Array, next_obs: Array) -> Array:

@@ -88,15 +88,28 @@ def normalize(state: Normalizer, rows: Array, limit: float | None = LIMIT) -> Ar
     Args:
         state: the statistics.
         rows: `[..., F]`.
-        limit: how far from the mean they are kept, on both sides; None: wherever they are.
+        limit: how far from the mean they are kept, on both sides, to rounding; None: wherever they are.
+
+    Raises:
+        FieldError: rows of another width.
+    """
+    # Before the division, not after it: programs whose rows are all within then round as they do without a limit.
+    rows = rows if limit is None else clip(state, rows, limit)
+    _check_width("rows", state, rows)
+    shape = (1,) * (rows.ndim - 1) + state.mean.shape
+    return (rows - state.mean.reshape(shape)) / state.std.reshape(shape)
+
+
+def clip(state: Normalizer, rows: Array, limit: float = LIMIT) -> Array:
+    """Rows within `limit` standard deviations of the mean, in their own units. `rows` is `[..., F]`.
 
     Raises:
         FieldError: rows of another width.
     """
     _check_width("rows", state, rows)
     shape = (1,) * (rows.ndim - 1) + state.mean.shape
-    deviations = (rows - state.mean.reshape(shape)) / state.std.reshape(shape)
-    return deviations if limit is None else jnp.clip(deviations, -limit, limit)
+    mean, reach = state.mean.reshape(shape), limit * state.std.reshape(shape)
+    return jnp.clip(rows, mean - reach, mean + reach)
 
 
 def denormalize(state: Normalizer, rows: Array) -> Array:

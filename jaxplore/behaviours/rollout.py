@@ -102,8 +102,8 @@ def rollout(
             delta = jnp.clip(delta, -bound, bound)
         next_obs = belief.encoding.next_obs(normalizers, obs, delta)
         if bound:
-            seen = normalizer.normalize(normalizers.obs, next_obs, limit=bound)
-            next_obs = normalizer.denormalize(normalizers.obs, seen)
+            seen = normalizer.normalize(normalizers.obs, next_obs, limit=None)
+            next_obs = normalizer.denormalize(normalizers.obs, jnp.clip(seen, -bound, bound))
         never = jnp.zeros(num_actors, bool)
         return next_obs, Transition(obs, action, score(prediction, delta, normalizers), next_obs, never, never)
 
