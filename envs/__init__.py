@@ -46,8 +46,8 @@ def check_name(name: str) -> None:
     `gymnasium:Pendulum-v1`, `brax:hopper` or `playground:CartpoleBalance`.
 
     Raises:
-        FieldError: an unknown name or prefix, with the nearest match and what is allowed; or the package is missing,
-            with what to install.
+        FieldError: an unknown name or prefix, with the nearest match and what is allowed; a package that is missing,
+            with what to install; or a module of somebody's that has not been imported, as reading a name imports none.
     """
     find_factory(name)
 

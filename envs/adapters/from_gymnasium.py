@@ -263,7 +263,7 @@ class Live:
                 for action in past.actions[at[1] : count]:
                     env.step(_native(self._action_space, action))
                 at = past, count
-                yield np.asarray(env.render())
+                yield env.render()
         finally:
             env.close()
 
@@ -311,7 +311,7 @@ class Checked(gymnasium.Wrapper):
         env_id: in Gymnasium's registry.
 
     Raises:
-        EnvironmentFault: from `reset` and `step`.
+        EnvironmentFault: from `reset`, `step` and `render`.
     """
 
     def __init__(self, env: gymnasium.Env, env_id: str) -> None:
@@ -351,6 +351,14 @@ class Checked(gymnasium.Wrapper):
         except ValueError as error:
             what = f"returned terminated and truncated of {shape_of(terminated)} and {shape_of(truncated)}"
             raise self._fault(what, "True or False") from error
+
+    def render(self) -> np.ndarray:
+        """A picture."""
+        expected = "a picture, [height, width, 3]"
+        picture = self._call(expected, self.env.render)
+        if np.ndim(picture) != 3:
+            raise self._fault(f"returned a picture of {shape_of(picture)}", expected)
+        return np.asarray(picture)
 
     def _call(self, expected: str, function: Callable[[], Any]) -> Any:
         try:

@@ -430,6 +430,36 @@ def test_refuses_bad_actions():
         env.step(state, np.array([np.nan]))
 
 
+@pytest.mark.parametrize(
+    ("drawn", "message"),
+    [
+        (
+            None,
+            r"returned a picture of type NoneType at step 1 of an episode\. Expected: a picture, \[height, width, ",
+        ),
+        (OSError("no screen"), r"raised OSError: no screen at step 1 of an episode\. Expected: a picture"),
+    ],
+)
+def test_a_picture_that_cannot_be_drawn_is_said_in_a_line(drawn, message):
+    class Undrawn(Toy):
+        metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+
+        def __init__(self, render_mode=None):
+            self.render_mode = render_mode
+
+        def render(self):
+            if drawn is not None:
+                raise drawn
+
+    gymnasium.registry.pop("jaxplore_test/Undrawn-v0", None)
+    gymnasium.register("jaxplore_test/Undrawn-v0", Undrawn)
+    env = envs.make("gymnasium:jaxplore_test/Undrawn-v0")
+    states, _ = walk(env, env.reset(jax.random.key(0)), [np.ones(2)])
+    assert env.view is not None
+    with pytest.raises(EnvironmentFault, match=message):
+        list(env.view.frames(states[1:], 8, 10, "own"))
+
+
 def test_pictures_are_of_the_states_in_any_order():
     class Painted(Toy):
         metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
