@@ -18,6 +18,8 @@ FOLDERS = ("envs", "experiments")
 LEFT_OUT = ("results",)
 """Folders in them that are of the repository."""
 PTH, STARTUP = "jaxplore.pth", "_jaxplore_gymnasium.py"
+AT_START = "import _jaxplore_gymnasium; _jaxplore_gymnasium.wait()\n"
+"""What Python carries out when it starts."""
 
 _NAMES = "|".join(FOLDERS)
 _FROM = re.compile(rf"\Afrom\s+(?=(?:{_NAMES})\b)")
@@ -38,7 +40,7 @@ class BuildHook(BuildHookInterface):
         """Add files to a wheel; an editable one gets only what Python reads at its start."""
         root, self._drafts = Path(self.root), Path(tempfile.mkdtemp())
         pth = self._drafts / PTH
-        pth.write_text(f"import {STARTUP.removesuffix('.py')}\n")
+        pth.write_text(AT_START)
         startup = {str(pth): PTH, str(root / "jaxplore/_install/startup.py"): STARTUP}
         if version == "editable":
             build_data["force_include_editable"].update(startup)
