@@ -1,5 +1,6 @@
 """The numbers of a run in Weights & Biases."""
 
+import importlib
 import secrets
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -46,7 +47,7 @@ class WandbLog:
         if project is None:
             return
         try:
-            import wandb
+            wandb: Any = importlib.import_module("wandb")  # Which this file is called, too.
         except ImportError as error:
             raise RunError(f'--wandb needs wandb ({error}). What to do: pip install -e ".[wandb]".') from error
         own_id = _own_id(directory, new=after_step is None)
