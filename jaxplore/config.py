@@ -56,8 +56,9 @@ class ExplorationConfig:
     """How much of what Gaussian networks' variances differ by the Jensen-Renyi divergence sees, (0, 1].
     nnaisense/max: 0.1."""
     planner: Planner = "sac"
-    """How models and reward become behaviour: `sac`, trained in imagination, or `mcts`, tree search at each real step,
-    for one-hot observations and discrete actions. Paper: `mcts` for the chain."""
+    """How models and reward become behaviour: `sac`, trained in imagination (double DQN where actions are discrete), or
+    `mcts`, tree search at each real step, for one-hot observations and discrete actions. Paper: `mcts` for the
+    chain."""
     dynamics: DynamicsConfig = field(default_factory=DynamicsConfig)
     ensemble: EnsembleConfig = field(default_factory=EnsembleConfig)
     generator: GeneratorConfig = field(default_factory=GeneratorConfig)
@@ -72,6 +73,7 @@ class ExplorationConfig:
     mcts: MCTSConfig = field(default_factory=MCTSConfig)
     model_free: ModelFreeConfig = field(default_factory=ModelFreeConfig)
     ddqn: DDQNConfig = field(default_factory=DDQNConfig)
+    """Double DQN, on the task's reward or, where actions are discrete, in place of `sac`."""
     ddpg: DDPGConfig = field(default_factory=DDPGConfig)
     task_sac: SACConfig = TASK_SAC
     """SAC on the task's reward. `sac_v2` learns `alpha` and leaves the reward as it is."""

@@ -1,7 +1,7 @@
 """The methods table: a method is a belief, an intrinsic reward, and a way to turn the reward into behaviour.
 
-Everything else is shared. To add a method, add a row; what it needs and `jaxplore.parts` does not offer is one new
-factory.
+Everything else is shared. Where actions are discrete, double DQN stands in for the SAC of a method. To add a method,
+add a row; what it needs and `jaxplore.parts` does not offer is one new factory.
 """
 
 import dataclasses
@@ -58,12 +58,28 @@ class Method(NamedTuple):
         kind = "discrete" if sizes.discrete else "continuous"
         return self.actions in ("any", kind) and (sizes.has_reward or not self.needs_reward)
 
-    def reads(self, config: ExplorationConfig) -> frozenset[str]:
-        """Fields of the configuration that this method looks at; those of a part that does not say so: all."""
+    def reads(self, config: ExplorationConfig, sizes: Sizes | None = None) -> frozenset[str]:
+        """Fields of the configuration that this method looks at; those of a part that does not say so: all.
+
+        Args:
+            config: all settings, some of which decide on others.
+            sizes: of the environment; whether its actions are discrete decides on the learner. None: not known. Then
+                those that are read where actions are numbers and, where the method takes both, what is read for
+                discrete ones alone and is not as it is by default.
+        """
+        if sizes is not None or self.actions != "any":
+            return self._reads(config, self.actions == "discrete" if sizes is None else sizes.discrete)
+        numbers, choices = (self._reads(config, discrete) for discrete in (False, True))
+        defaults = ExplorationConfig()
+        return numbers | {name for name in choices - numbers if getattr(config, name) != getattr(defaults, name)}
+
+    def _reads(self, config: ExplorationConfig, discrete: bool) -> frozenset[str]:
         found = set(SHARED)
-        for part in (self.belief, self.reward, self.behaviour):
+        for part in (self.belief, self.reward):
             own = getattr(part, "reads", None)
             found |= set(own(config)) if own else {item.name for item in dataclasses.fields(config)}
+        own = getattr(self.behaviour, "reads", None)
+        found |= set(own(config, discrete)) if own else {item.name for item in dataclasses.fields(config)}
         # Of every belief the divergence is logged, too.
         return frozenset(found if self.belief is no_belief else found | {"renyi_decay"})
 
@@ -142,7 +158,6 @@ METHODS: dict[str, Method] = {
         gaussian_belief,
         divergence_reward,
         sac_on_real_data,
-        actions="continuous",
         settings=as_max_reactive,
     ),
     "max_trajectory": Method(
@@ -150,7 +165,6 @@ METHODS: dict[str, Method] = {
         gaussian_belief,
         spread_reward,
         sac_in_imagination,
-        actions="continuous",
         settings=as_max_trajectory,
     ),
     "prediction_error": Method(
@@ -158,7 +172,6 @@ METHODS: dict[str, Method] = {
         gaussian_belief,
         error_reward,
         sac_on_real_data,
-        actions="continuous",
         settings=as_max_prediction_error,
     ),
     "icm": Method(
@@ -166,14 +179,12 @@ METHODS: dict[str, Method] = {
         static_belief,
         error_reward,
         sac_on_real_data,
-        actions="continuous",
     ),
     "icm_active": Method(
         "static networks, error of their mean, SAC in imagination, where a model stands for the truth",
         static_belief,
         error_reward,
         sac_in_imagination,
-        actions="continuous",
     ),
     "disagreement_grad": Method(
         "static networks, variance reward, policy by the reward's own gradient through the models",
@@ -194,7 +205,6 @@ METHODS: dict[str, Method] = {
         no_belief,
         no_reward,
         distillation_with_sac,
-        actions="continuous",
     ),
     "ddqn": Method(
         "double DQN with epsilon-greedy actions on the environment's own reward, for discrete actions",

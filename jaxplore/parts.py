@@ -31,22 +31,32 @@ from jaxplore.types import Array
 from jaxplore.validate import FieldError
 
 
-def reads(*fields: Any) -> Callable[[Any], Any]:
+def reads(*fields: Any, discrete: tuple[str, ...] | None = None) -> Callable[[Any], Any]:
     """Mark a part with the fields of `ExplorationConfig` that it reads.
 
     Args:
-        *fields: their names; or one function of the configuration that gives them, where they depend on it.
+        *fields: their names; or one function that gives them, `(config, discrete) -> names`.
+        discrete: their names where actions are discrete, if they are others.
 
     Returns:
-        A decorator; the part then has `reads(config) -> names`.
+        A decorator; the part then has `reads(config, discrete=False) -> names`.
     """
-    names: Any = fields[0] if fields and callable(fields[0]) else lambda config: set(fields)
+
+    def names(config: Any, is_discrete: bool = False) -> set[str]:
+        return set(discrete if is_discrete and discrete is not None else fields)
 
     def mark(part: Any) -> Any:
-        part.reads = names
+        part.reads = fields[0] if fields and callable(fields[0]) else names
         return part
 
     return mark
+
+
+def make_learner(sizes: Sizes, config: ExplorationConfig) -> Learner:
+    """Who learns from an intrinsic reward: SAC or, where an action is one of several choices, double DQN."""
+    if sizes.discrete:
+        return make_ddqn(sizes.obs, sizes.action, config.ddqn)
+    return make_sac(sizes.obs, sizes.action, config.sac)
 
 
 @reads("dynamics", "generator", "svgd", "fit")
@@ -132,26 +142,20 @@ def no_reward(config: ExplorationConfig) -> Reward:
     return NO_REWARD
 
 
-@reads("imagination", "sac")
+@reads("imagination", "sac", discrete=("imagination", "ddqn"))
 def sac_in_imagination(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
-    """SAC, trained in rollouts that the belief's models imagine. Refuses discrete actions."""
-    if sizes.discrete:
-        raise FieldError(
-            "planner",
-            "sac",
-            "planner='mcts' where observations are one-hot, or a method without SAC, such as random",
-            f"acts by numbers in [-1, 1]; here an action is one of {sizes.action} choices",
-            "ExplorationConfig",
-        )
-    sac = make_sac(sizes.obs, sizes.action, config.sac)
-    return make_imagination(belief, score, sac, sizes.obs, sizes.action, config.imagination)
+    """SAC, or double DQN where actions are discrete, trained in rollouts that the belief's models imagine."""
+    learner = make_learner(sizes, config)
+    return make_imagination(belief, score, learner, sizes.obs, sizes.action, config.imagination, sizes.discrete)
 
 
-@reads("reactive", "sac")
+@reads("reactive", "sac", discrete=("reactive", "ddqn"))
 def sac_on_real_data(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
-    """SAC on real transitions, relabelled in each round; nothing is imagined."""
-    sac = make_sac(sizes.obs, sizes.action, config.sac)
-    return make_reactive(belief, score, sac, sizes.obs, sizes.action, config.reactive)
+    """SAC, or double DQN where actions are discrete, on real transitions, relabelled in each round; nothing is
+    imagined.
+    """
+    learner = make_learner(sizes, config)
+    return make_reactive(belief, score, learner, sizes.obs, sizes.action, config.reactive)
 
 
 @reads("mcts")
@@ -161,7 +165,7 @@ def tree_search(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: 
         raise FieldError(
             "planner",
             "mcts",
-            "planner='sac' where actions are numbers",
+            "planner='sac'",
             "searches finitely many states and actions; here actions are numbers or observations are not one-hot",
             "ExplorationConfig",
         )
@@ -175,9 +179,15 @@ PLANNERS: dict[str, Any] = {
 """`ExplorationConfig.planner` -> behaviour."""
 
 
-@reads(lambda config: {"planner"} | PLANNERS[config.planner].reads(config))
+@reads(lambda config, discrete=False: {"planner"} | PLANNERS[config.planner].reads(config, discrete))
 def planned(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
-    """The behaviour that the configuration names, for methods that plan in their models."""
+    """The behaviour that the configuration names, for methods that plan in their models. Finitely many states and
+    actions are searched, not learned.
+    """
+    if config.planner == "sac" and sizes.discrete and sizes.one_hot_obs:
+        given = f"an observation is one of {sizes.obs} states and an action one of {sizes.action} choices"
+        problem = f"is for observations or actions that are numbers; here {given}"
+        raise FieldError("planner", "sac", "planner='mcts'", problem, "ExplorationConfig")
     return PLANNERS[config.planner](sizes, config, belief, score)
 
 
@@ -194,12 +204,14 @@ def distillation_with_ppo(sizes: Sizes, config: ExplorationConfig, belief: Belie
     return make_rnd_ppo(sizes.obs, sizes.action, config.steps_per_round, config.warm_up_steps, config.ppo, config.rnd)
 
 
-@reads("rnd", "reactive", "sac")
+@reads("rnd", "reactive", "sac", discrete=("rnd", "reactive", "ddqn"))
 def distillation_with_sac(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
-    """Random network distillation with SAC on all real transitions, as many updates as other methods have."""
+    """Random network distillation with SAC, or double DQN where actions are discrete, on all real transitions, as many
+    updates as other methods have.
+    """
     _check_replay_keeps_a_round(config)
-    sac = make_sac(sizes.obs, sizes.action, config.sac)
-    return make_rnd_learner(sac, sizes.obs, config.steps_per_round, config.reactive, config.rnd)
+    learner = make_learner(sizes, config)
+    return make_rnd_learner(learner, sizes.obs, config.steps_per_round, config.reactive, config.rnd)
 
 
 def _check_replay_keeps_a_round(config: ExplorationConfig) -> None:

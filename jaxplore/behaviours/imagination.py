@@ -22,6 +22,7 @@ from jaxplore.behaviours.base import (
     train,
 )
 from jaxplore.behaviours.rollout import Mover, World, rollout
+from jaxplore.behaviours.uniform import uniform_actions
 from jaxplore.beliefs.base import Belief
 from jaxplore.learners.base import Learner
 from jaxplore.replay import Replay
@@ -97,20 +98,29 @@ class Imagination(NamedTuple):
     example: Transition
     """One transition of zeros, in the environment's shapes."""
     config: ImaginationConfig
+    discrete: bool
+    """Whether an action is one of `A` choices, as a one-hot vector."""
 
 
 def make_imagination(
-    belief: Belief, score: Score, learner: Learner, obs_size: int, action_size: int, config: ImaginationConfig
+    belief: Belief,
+    score: Score,
+    learner: Learner,
+    obs_size: int,
+    action_size: int,
+    config: ImaginationConfig,
+    discrete: bool = False,
 ) -> Behaviour:
     """Train a learner in rollouts imagined by the belief's models (Algorithm 1, lines 7-9).
 
     Args:
         belief: whose models imagine; it must predict.
         score: the intrinsic reward.
-        learner: such as `make_sac` gives; it sees normalised observations.
+        learner: such as `make_sac` gives, or where actions are discrete `make_ddqn`; it sees normalised observations.
         obs_size: `O`.
         action_size: `A`.
         config: how much of everything.
+        discrete: whether an action is one of `A` choices, as a one-hot vector.
 
     Returns:
         A `Behaviour`. The metrics are the learner's, from the last update, and `imagined_reward`,
@@ -137,7 +147,7 @@ def make_imagination(
     validate.sizes(obs_size=obs_size, action_size=action_size)
     flag = jnp.zeros((), bool)
     example = Transition(jnp.zeros(obs_size), jnp.zeros(action_size), jnp.zeros(()), jnp.zeros(obs_size), flag, flag)
-    parts = Imagination(belief, score, learner, example, config)
+    parts = Imagination(belief, score, learner, example, config, discrete)
     return Behaviour(
         init=functools.partial(init, parts),
         improve=functools.partial(improve, parts),
@@ -209,7 +219,7 @@ def imagine(
 
     def act(key: Key, obs: Array) -> Array:
         drawn = parts.learner.act(key, actor, normalizer.normalize(normalizers.obs, obs))
-        return jnp.where(is_random, jax.random.uniform(key, drawn.shape, minval=-1.0, maxval=1.0), drawn)
+        return jnp.where(is_random, uniform_actions(key, obs, drawn.shape[-1], parts.discrete), drawn)
 
     world = World(parts.belief, experience.models, normalizers, parts.score)
     start = starts(start_key, experience, config.num_actors, config.current_fraction)

@@ -13,6 +13,7 @@ from jaxplore.config import ExplorationConfig, Sizes
 from jaxplore.exploration import make_explorer
 from jaxplore.learners import sac
 from jaxplore.learners.ddpg import DDPGConfig
+from jaxplore.learners.ddqn import DDQNConfig
 from jaxplore.learners.ppo import PPOConfig
 from jaxplore.methods import METHODS, SHARED
 from jaxplore.signals.distillation import UNIT, RNDConfig
@@ -77,27 +78,29 @@ PLANNED = ("implicit", "disagreement", "max")
 
 
 @pytest.mark.parametrize(
-    ("name", "config"),
-    [*((name, CONFIG) for name in sorted(METHODS)), *((name, CHAIN) for name in PLANNED)],
-    ids=[*sorted(METHODS), *(f"{name} by tree search" for name in PLANNED)],
+    ("name", "config", "sizes"),
+    [
+        *((name, CONFIG, Sizes(3, 2)) for name, row in METHODS.items() if row.actions != "discrete"),
+        *((name, CONFIG, Sizes(3, 2, True)) for name, row in METHODS.items() if row.actions != "continuous"),
+        *((name, CHAIN, Sizes(3, 2, True, True)) for name in PLANNED),
+    ],
 )
-def test_a_method_reads_the_settings_that_it_declares(name, config):
+def test_a_method_reads_the_settings_that_it_declares(name, config, sizes):
     # no more, so that what a user sets is refused where it does nothing; and no fewer, so that it is not refused where
     # it does something. Read while belief, reward and behaviour are made; what all methods share counts for none
     method = METHODS[name]
-    sizes = Sizes(3, 2, discrete=config is CHAIN or method.actions == "discrete", one_hot_obs=config is CHAIN)
     config = method.settings(config)
     recorder = Recorder(config)
     belief, reward = method.belief(sizes, recorder), method.reward(recorder)
     method.behaviour(sizes, recorder, belief, reward.score)
-    declared = method.reads(config) - set(SHARED)
-    assert declared == method.reads(recorder) - set(SHARED)
+    declared = method.reads(config, sizes) - set(SHARED)
+    assert declared == method.reads(recorder, sizes) - set(SHARED)
     if belief.predict is None:
         assert recorder.seen - set(SHARED) == declared
     else:
         # Of every belief the divergence is reported, too.
         assert recorder.seen - set(SHARED) | {"renyi_decay"} == declared
-    assert set(SHARED) <= method.reads(config)
+    assert set(SHARED) <= method.reads(config, sizes)
     assert declared <= {field.name for field in dataclasses.fields(ExplorationConfig)}
 
 
@@ -107,6 +110,20 @@ def test_planners_read_their_own_settings():
         CONFIG
     )
     assert "mcts" in METHODS["implicit"].reads(CHAIN) and not {"sac", "imagination"} & METHODS["implicit"].reads(CHAIN)
+
+
+def test_the_learner_that_is_read_hangs_on_the_actions():
+    # and where they are not known on what departs from the defaults, so that a run's identity has it
+    numbers, choices = Sizes(3, 2), Sizes(3, 2, discrete=True)
+    changed = dataclasses.replace(CONFIG, ddqn=DDQNConfig(batch_size=8))
+    for name in ("implicit", "icm", "icm_active", "rnd_sac"):
+        reads = METHODS[name].reads
+        assert "sac" in reads(changed, numbers) and "ddqn" not in reads(changed, numbers)
+        assert "ddqn" in reads(CONFIG, choices) and "sac" not in reads(CONFIG, choices)
+        assert reads(CONFIG) == reads(CONFIG, numbers)
+        assert reads(changed) == reads(changed, numbers) | {"ddqn"}
+    assert METHODS["implicit_grad"].reads(changed) == METHODS["implicit_grad"].reads(CONFIG)
+    assert METHODS["ddqn"].reads(changed) == METHODS["ddqn"].reads(CONFIG, choices)
 
 
 DELTA, RAW, OF_OBS = "normalised delta, squared", "raw units, squared", "std of the observation, squared"
