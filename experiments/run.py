@@ -47,6 +47,8 @@ class CommandLine:
     parent: str | None = None
     """Start from the policy of another run: DIRECTORY or DIRECTORY@STEP (by default its latest checkpoint). Its
     observation statistics come with it; critics are new and there are no data. For methods on the task's reward."""
+    wandb: str | None = None
+    """Also log to this project of Weights & Biases; WANDB_MODE=offline keeps it on this machine."""
     debug: bool = False
     """Show the traceback below the message of an error."""
     version: bool = False
@@ -98,7 +100,7 @@ def parse(argv: Sequence[str]) -> tuple[CommandLine, RunSpec]:
     command, changes = flags.parse(
         words, (CommandLine(), start.config), prog=PROGRAM, description=description, layout=layout
     )
-    paths = {name: command[name] or None for name in ("out", "config", "parent")}
+    paths = {name: command[name] or None for name in ("out", "config", "parent", "wandb")}
     try:
         ref = RunRef.parse(paths["parent"]) if paths["parent"] else start.parent
         config: RunConfig = replace(start.config, changes)
@@ -182,7 +184,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             process.show_cause(error, debug=debug)
             return 2
         with place.owned(command.out, spec, chosen, resume=command.resume) as directory:
-            return carry_out(spec, directory, env, agent, programs, resume=command.resume)
+            return carry_out(spec, directory, env, agent, programs, command)
     except RunError as error:
         print(f"\nerror: {error}", file=sys.stderr)
         process.show_cause(error, debug=debug)
@@ -222,12 +224,17 @@ def prepare(spec: RunSpec, *, resume: bool) -> tuple[Environment, Explorer, Prog
 
 
 def carry_out(
-    spec: RunSpec, directory: RunDirectory, env: Environment, agent: Explorer, programs: Programs, *, resume: bool
+    spec: RunSpec,
+    directory: RunDirectory,
+    env: Environment,
+    agent: Explorer,
+    programs: Programs,
+    command: CommandLine,
 ) -> int:
     """Run, draw, and close with the summary table."""
     config = spec.config
     runtime.use_compilation_cache()
-    if resume and (changed := directory.changed_versions()):
+    if command.resume and (changed := directory.changed_versions()):
         print(f"Versions have changed, so not to the bit: {'; '.join(changed)}", file=sys.stderr)
     if directory.status() is not Status.ABSENT and place.lengthens(directory, spec):
         directory.extend(spec)
@@ -245,7 +252,7 @@ def carry_out(
             f"writing to {directory}",
             flush=True,
         )
-        loop.run(spec, directory, env, agent, programs, resume=resume)
+        loop.run(spec, directory, env, agent, programs, resume=command.resume, wandb=command.wandb)
     print("\n" + report.write(directory))
     return 0
 

@@ -7,7 +7,7 @@
 | `scene.json` | what coverage counts, the floor plan, units: what reports need of the environment |
 | `metrics.jsonl` | a row per round and seed; compressed, `metrics.jsonl.gz`, in a run that was kept |
 | `checkpoints/` | the latest states, whole |
-| `tensorboard/` | the rows as TensorBoard events |
+| `tensorboard/`, `wandb/` | the rows as TensorBoard events, and in Weights & Biases |
 | `walk.npz` | where each step began |
 | `outcome.json` | how the run ended; the last file to be written |
 | `calibration.json` | what its belief knows, if that was asked |
@@ -30,7 +30,7 @@ from experiments.runs import scene as scenes
 from experiments.runs import spec as specs
 from experiments.runs.asked import is_calibration
 from experiments.runs.checkpoint import Checkpoints
-from experiments.runs.config import RunConfig
+from experiments.runs.config import RunConfig, to_dict
 from experiments.runs.errors import RunError, disk_error
 from experiments.runs.files import read_json, read_text, replacing, sweep, write_text
 from experiments.runs.metrics import MetricsLog, read_metrics
@@ -38,10 +38,11 @@ from experiments.runs.scene import Scene
 from experiments.runs.spec import RunSpec
 from experiments.runs.status import Status
 from experiments.runs.tensorboard import TensorBoardLog
+from experiments.runs.wandb import WandbLog
 
 CONFIG, VERSIONS, SCENE, OUTCOME = "config.json", "versions.json", "scene.json", "outcome.json"
 METRICS, PACKED_METRICS, WALK = "metrics.jsonl", "metrics.jsonl.gz", "walk.npz"
-CHECKPOINTS, TENSORBOARD = "checkpoints", "tensorboard"
+CHECKPOINTS, TENSORBOARD, WANDB = "checkpoints", "tensorboard", "wandb"
 CALIBRATION, OLD_CALIBRATION = "calibration.json", "posterior.json"
 KEPT = (CONFIG, VERSIONS, SCENE, OUTCOME, CALIBRATION, OLD_CALIBRATION)
 """Files that `RunDirectory.keep` copies as they are, those that there are."""
@@ -222,9 +223,13 @@ class RunDirectory:
         """The log that rows are appended to."""
         return MetricsLog(self.path / METRICS)
 
-    def tensorboard_log(self, num_seeds: int, after_step: int | None) -> TensorBoardLog:
-        """The log of TensorBoard events; `after_step` as `TensorBoardLog` has it."""
-        return TensorBoardLog(self.path / TENSORBOARD, num_seeds=num_seeds, after_step=after_step)
+    def sinks(self, after_step: int | None, project: str | None) -> list[TensorBoardLog | WandbLog]:
+        """What rows are also written to: TensorBoard events, and a project of Weights & Biases where one is named;
+        `after_step` as `TensorBoardLog` has it.
+        """
+        config, seeds = self.config(), {"num_seeds": self.config().num_seeds, "after_step": after_step}
+        tensorboard = TensorBoardLog(self.path / TENSORBOARD, **seeds)
+        return [tensorboard, WandbLog(self.path / WANDB, project, **seeds, config=to_dict(config))]
 
     def write_walk(self, positions: np.ndarray, episode_steps: np.ndarray) -> None:
         """Save where each step began. Raises `RunError` if it cannot be written."""

@@ -35,6 +35,7 @@ def run(
     programs: Programs | None = None,
     *,
     resume: bool = False,
+    wandb: str | None = None,
 ) -> RunState:
     """Carry out a run, from its latest checkpoint if `resume`, and write what comes of it to its directory.
 
@@ -45,6 +46,7 @@ def run(
         agent: the agent that `spec` names.
         programs: of the run, where they have been made already.
         resume: whether to continue from the latest checkpoint; without one the run starts over.
+        wandb: project of Weights & Biases to log to as well; None: none.
 
     Returns:
         The last state.
@@ -53,7 +55,7 @@ def run(
         RunError: the disk fails, a checkpoint does not fit, or no seed is left whose numbers are finite. The latest
             checkpoint is then whole.
     """
-    session = Session(spec, directory, env, agent, programs or make_programs(spec.config, env, agent))
+    session = Session(spec, directory, env, agent, programs or make_programs(spec.config, env, agent), wandb)
     try:
         session.start(resume=resume)
         try:
@@ -84,6 +86,7 @@ class Session:
         env: the environment.
         agent: the agent.
         programs: its functions.
+        wandb: project of Weights & Biases to log to as well.
     """
 
     state: RunState
@@ -91,9 +94,15 @@ class Session:
     """Environment steps taken."""
 
     def __init__(
-        self, spec: RunSpec, directory: RunDirectory, env: Environment, agent: Explorer, programs: Programs
+        self,
+        spec: RunSpec,
+        directory: RunDirectory,
+        env: Environment,
+        agent: Explorer,
+        programs: Programs,
+        wandb: str | None = None,
     ) -> None:
-        self.spec, self.directory, self.env, self.agent = spec, directory, env, agent
+        self.spec, self.directory, self.env, self.agent, self.wandb = spec, directory, env, agent, wandb
         self.config: RunConfig = spec.config
         self.programs: Programs = programs
         evaluates = spec.config.eval_every > 0
@@ -123,7 +132,7 @@ class Session:
         )
         last = self.step if restored is not None else -1
         self.log.truncate_after(last)
-        self.board = self.directory.tensorboard_log(self.config.num_seeds, last if resume else None)
+        self.sinks = self.directory.sinks(last if resume else None, self.wandb)
         self.progress = console.Progress(
             self.config.steps,
             start_step=self.step,
@@ -166,7 +175,8 @@ class Session:
         """End the progress bar and close the files."""
         self.progress.close()
         self.log.close()
-        self.board.close()
+        for sink in self.sinks:
+            sink.close()
 
     def diverged(self) -> dict[int, dict[str, Any]]:
         """By seed when and by what its numbers stopped being finite."""
@@ -207,7 +217,8 @@ class Session:
         times = {"wall_time": round(now - self.began, 3), "steps_per_second": round((end - first) / (now - began), 3)}
         rows = record.rows(config.seed, end, self.state.visited, alive, (own, metrics, broken, times))
         self.log.append(rows)
-        self.board.append(rows)
+        for sink in self.sinks:
+            sink.append(rows)
         self.progress.update(end, rows)
         if not survivors.any():
             self._give_up(broken, (first, end))
@@ -223,7 +234,7 @@ class Session:
 
     def _save(self, step: int, state: RunState | None = None) -> None:
         self.log.sync()
-        meta = {"wall_time": time.monotonic() - self.began, "identity": self.spec.identity, "steps": self.config.steps}
+        meta = record.meta(self.spec, step, time.monotonic() - self.began)
         self.checkpoints.save(step, state or self.state, meta)
 
     def _announce(self, what: str) -> None:

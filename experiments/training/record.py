@@ -1,5 +1,6 @@
 """What a round leaves in a run's state and in its rows; all of it NumPy, on the host."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
 from experiments.runs.metrics import Row
+from experiments.runs.spec import RunSpec
 from experiments.training.programs import RunState
 
 
@@ -93,6 +95,19 @@ def rows(
             row["diverged"] = ", ".join(broken_by_seed[i])
         found.append({**row, **times})
     return found
+
+
+def meta(spec: RunSpec, step: int, wall_time: float) -> dict[str, Any]:
+    """What a checkpoint says of itself: what resuming checks, and what it holds, for people who find it alone."""
+    config = spec.config
+    seeds = f"seed {config.seed}" if config.num_seeds == 1 else f"{config.num_seeds} seeds from {config.seed} on"
+    return {
+        "wall_time": wall_time,
+        "identity": spec.identity,
+        "steps": config.steps,
+        "holds": f"{config.method} on {config.env} after {step} steps, {seeds}",
+        "parts": [field.name for field in dataclasses.fields(RunState)],
+    }
 
 
 def diverged_error(directory: RunDirectory, names: list[str], seeds: list[int], span: tuple[int, int]) -> RunError:
