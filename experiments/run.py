@@ -24,8 +24,9 @@ from experiments.runs.status import Status
 from experiments.runs.upgrades import MOVED
 from experiments.training import build, loop, memory, parent
 from experiments.training.programs import Programs, make_programs
+from jaxplore.config import Sizes
 from jaxplore.exploration import Explorer
-from jaxplore.methods import METHODS
+from jaxplore.methods import METHODS, SHARED
 from jaxplore.networks import ACTIVATIONS, INITIALIZERS
 from jaxplore.validate import FieldError
 
@@ -139,8 +140,13 @@ def _read(path: Path, method: str | None) -> RunSpec:
         raise RunError(f"cannot read the configuration {path}: {error}.") from error
 
 
-def check_read(argv: Sequence[str], config: RunConfig) -> None:
+def check_read(argv: Sequence[str], config: RunConfig, sizes: Sizes | None = None) -> None:
     """Refuse a flag that the chosen method does not read: it would do nothing.
+
+    Args:
+        argv: the words after the program's name.
+        config: what they come to.
+        sizes: of the environment, where it has been made: whether actions are discrete decides on the learner.
 
     Raises:
         ValueError: names the flag and the methods that read it.
@@ -149,8 +155,15 @@ def check_read(argv: Sequence[str], config: RunConfig) -> None:
     fields = {item.name for item in dataclasses.fields(explorer)}
     for name in flags.given(argv):
         field = name.partition(".")[0]
-        if field not in fields or field in method.reads(explorer):
+        if field not in fields or field in method.reads(explorer, sizes):
             continue
+        if sizes is not None:
+            kind = "discrete" if sizes.discrete else "numbers"
+            others = [known for known in method.reads(explorer, sizes) - set(SHARED) if hasattr(explorer, known)]
+            raise ValueError(
+                f"--{name.replace('_', '-')} does nothing with method={config.method!r} in {config.env}, where actions "
+                f"are {kind}. Allowed: settings of {', '.join(sorted(others))}."
+            )
         variants = [dataclasses.replace(explorer, planner=planner) for planner in ("sac", "mcts")]
         reading = [known for known, row in METHODS.items() if any(field in row.reads(one) for one in variants)]
         if config.method in reading:
@@ -178,6 +191,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 print("\n".join(f"{name} {version}" for name, version in runtime.versions().items()))
                 return 0
             env, agent, programs, spec = prepare(spec, resume=command.resume)
+            check_read(argv, spec.config, build.sizes_of(env))
             chosen = place.choose(command.out, spec, resume=command.resume)
         except (ValueError, RunError) as error:
             print(f"error: {error}", file=sys.stderr)
