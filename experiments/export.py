@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments import process
+from experiments.runs import modules
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError, disk_error
 from experiments.runs.files import replacing
@@ -50,9 +51,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m experiments.export", description=__doc__)
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="directory of a run")
     parser.add_argument("--out", type=Path, help="the file to write (default: print)")
+    modules.add_flag(parser)
     process.add_flag(parser)
     arguments = parser.parse_args(argv)
     try:
+        modules.load(arguments.imports)
         text = to_csv(arguments.runs)
         if arguments.out is None:
             print(text, end="")

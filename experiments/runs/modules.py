@@ -6,7 +6,7 @@ Importing a module runs it. A run's directory may come from somebody else, so it
 import argparse
 import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from experiments.runs.errors import RunError
 
@@ -59,7 +59,7 @@ def of_env(env: str | None) -> list[str]:
     return [module] if package == "gymnasium" and colon else []
 
 
-def check(names: Sequence[str], source: str) -> None:
+def check(names: Iterable[str], source: str) -> None:
     """Refuse a file that needs a module which nobody has asked for.
 
     Raises:

@@ -113,7 +113,7 @@ def from_json(text: str, source: str, method: str | None = None, *, as_written: 
         )
     identity, parent = data.pop("identity", None), data.pop("parent", None)
     imports = _imports(data.pop("imports", []), source)
-    modules.check([*imports, *modules.of_env(str(data.get("env", "")))], source)
+    modules.check(dict.fromkeys([*imports, *modules.of_env(str(data.get("env", "")))]), source)
     try:
         names = (data.get("preset", "laptop"), data.get("env", "ant_maze"), data.get("method", method or "implicit"))
         start = preset_config(*names)
