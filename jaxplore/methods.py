@@ -52,11 +52,14 @@ class Method(NamedTuple):
     """Which actions it can choose."""
     settings: Callable[[ExplorationConfig], ExplorationConfig] = lambda config: config
     """Where it departs from the settings that all share, as its authors have it; what a user sets comes on top."""
+    finite: bool = True
+    """Whether it can run where both observations and actions are finitely many, as on the chain."""
 
     def fits(self, sizes: Sizes) -> bool:
         """Whether it can run in an environment of these sizes, as far as this row says."""
         kind = "discrete" if sizes.discrete else "continuous"
-        return self.actions in ("any", kind) and (sizes.has_reward or not self.needs_reward)
+        takes = self.actions in ("any", kind) and (self.finite or not _finite(sizes))
+        return takes and (sizes.has_reward or not self.needs_reward)
 
     def reads(self, config: ExplorationConfig, sizes: Sizes | None = None) -> frozenset[str]:
         """Fields of the configuration that this method looks at; those of a part that does not say so: all.
@@ -82,6 +85,10 @@ class Method(NamedTuple):
         found |= set(own(config, discrete)) if own else {item.name for item in dataclasses.fields(config)}
         # Of every belief the divergence is logged, too.
         return frozenset(found if self.belief is no_belief else found | {"renyi_decay"})
+
+
+def _finite(sizes: Sizes) -> bool:
+    return sizes.discrete and sizes.one_hot_obs
 
 
 SHARED = ("warm_up_steps", "steps_per_round", "data_capacity")
@@ -159,6 +166,7 @@ METHODS: dict[str, Method] = {
         divergence_reward,
         sac_on_real_data,
         settings=as_max_reactive,
+        finite=False,
     ),
     "max_trajectory": Method(
         "static Gaussian networks, spread of the imagined changes, SAC in imagination (TVAX of nnaisense/max)",
@@ -166,6 +174,7 @@ METHODS: dict[str, Method] = {
         spread_reward,
         sac_in_imagination,
         settings=as_max_trajectory,
+        finite=False,
     ),
     "prediction_error": Method(
         "static Gaussian networks, error of their mean, SAC on real transitions (PERX of nnaisense/max)",
@@ -173,18 +182,21 @@ METHODS: dict[str, Method] = {
         error_reward,
         sac_on_real_data,
         settings=as_max_prediction_error,
+        finite=False,
     ),
     "icm": Method(
         "static networks, error of their mean, SAC on real transitions with as many updates as in imagination",
         static_belief,
         error_reward,
         sac_on_real_data,
+        finite=False,
     ),
     "icm_active": Method(
         "static networks, error of their mean, SAC in imagination, where a model stands for the truth",
         static_belief,
         error_reward,
         sac_in_imagination,
+        finite=False,
     ),
     "disagreement_grad": Method(
         "static networks, variance reward, policy by the reward's own gradient through the models",
@@ -205,6 +217,7 @@ METHODS: dict[str, Method] = {
         no_belief,
         no_reward,
         distillation_with_sac,
+        finite=False,
     ),
     "ddqn": Method(
         "double DQN with epsilon-greedy actions on the environment's own reward, for discrete actions",
@@ -270,9 +283,14 @@ def check_fits(method: Method, sizes: Sizes) -> None:
         )
     wanted = "one of several choices" if method.actions == "discrete" else "numbers in [-1, 1]"
     given = f"one of {sizes.action} choices" if sizes.discrete else f"numbers in [-1, 1], {sizes.action} of them"
+    kind = method.actions
+    if kind == "any":
+        wanted += " or, where they are choices, observations that are numbers"
+        given += f" and an observation one of {sizes.obs} states"
+        kind = "observations that are numbers, or with continuous"
     raise ValueError(
         f"{name} takes actions that are {wanted}; here an action is {given}. "
-        f"Allowed: an environment with {method.actions} actions, or one of the methods {fitting}."
+        f"Allowed: an environment with {kind} actions, or one of the methods {fitting}."
     )
 
 
