@@ -129,7 +129,7 @@ def _as_transitions(inputs: np.ndarray, values: np.ndarray) -> Transition:
     obs, action = inputs[:, :1].astype(np.float32), inputs[:, 1:].astype(np.float32)
     flags: Array = jnp.zeros(len(obs), bool)
     next_obs = obs + values[:, None].astype(np.float32)
-    return Transition(*map(jnp.asarray, (obs, action, np.zeros(len(obs), np.float32), next_obs)), flags, flags)
+    return Transition(jnp.asarray(obs), jnp.asarray(action), jnp.zeros(len(obs)), jnp.asarray(next_obs), flags, flags)
 
 
 def table(found: Sequence[Divergences]) -> str:

@@ -6,9 +6,10 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from experiments import process
@@ -47,9 +48,9 @@ def load(name: str) -> Stored:
 
 
 def _transition(arrays: dict[str, np.ndarray], kind: str) -> Transition:
-    obs, action, next_obs = (arrays[f"{kind}_{field}"] for field in FIELDS)
-    flags = np.zeros(len(obs), bool)
-    return Transition(obs, action, np.zeros(len(obs), np.float32), next_obs, flags, flags)
+    obs, action, next_obs = (jnp.asarray(arrays[f"{kind}_{field}"]) for field in FIELDS)
+    flags = jnp.zeros(len(obs), bool)
+    return Transition(obs, action, jnp.zeros(len(obs)), next_obs, flags, flags)
 
 
 def collect(run: Path) -> Stored:
@@ -70,17 +71,14 @@ def collect(run: Path) -> Stored:
     elsewhere = ask.walk_elsewhere(env, jax.random.key(config.seed), jax.jit(agent.act_uniformly))
     if elsewhere is None:
         raise RunError(f"{config.env} cannot be put where one likes, so nothing is known of elsewhere.")
-    rows = [jax.tree.map(lambda leaf, part=part: leaf[part], data.rows) for part in _parts(size)]
-    return Stored(*rows, elsewhere)
-
-
-def _parts(size: int) -> tuple[slice, slice]:
-    return slice(0, size - NUM_NEXT), slice(size - NUM_NEXT, size)
+    first, then = slice(0, size - NUM_NEXT), slice(size - NUM_NEXT, size)
+    known, came = (jax.tree.map(lambda leaf, part=part: leaf[part], data.rows) for part in (first, then))
+    return Stored(known, came, elsewhere)
 
 
 def save(stored: Stored, name: str) -> Path:
     """Store transitions under a name, and give the file."""
-    arrays = {
+    arrays: dict[str, Any] = {
         f"{kind}_{field}": np.asarray(getattr(rows, field), np.float32)
         for kind, rows in stored._asdict().items()
         for field in FIELDS
