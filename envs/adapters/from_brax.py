@@ -21,6 +21,8 @@ from jaxplore.validate import FieldError
 
 BACKENDS = ("generalized", "mjx", "positional", "spring")
 """Brax's engines."""
+NO_ENGINE = "jax"
+"""What an environment without physics is stepped by, such as Brax's own toy, `fast`."""
 
 
 @contextlib.contextmanager
@@ -57,7 +59,7 @@ def make_environment(
 
     Args:
         name: as Brax registers it.
-        backend: one of Brax's engines, or `auto`: the environment's own choice.
+        backend: one of Brax's engines, or `auto`: the environment's own choice; `jax` where there is no physics.
         obs_noise: standard deviation of Gaussian noise added to every observation entry, in raw units.
         episode_steps: steps after which an episode is truncated.
 
@@ -66,11 +68,14 @@ def make_environment(
             one vector, or a bad number.
     """
     check_name(name)
-    validate.one_of("backend", backend, ("auto", *BACKENDS))
+    if backend != NO_ENGINE:
+        validate.one_of("backend", backend, ("auto", *BACKENDS))
     with quiet(), jax.numpy_rank_promotion("allow"):
-        raw = load().get_environment(name, **({} if backend == "auto" else {"backend": backend}))
+        raw = load().get_environment(name, **({} if backend in ("auto", NO_ENGINE) else {"backend": backend}))
         model = getattr(getattr(raw, "sys", None), "mj_model", None)
-        own = getattr(raw, "_backend", "jax")
+        own = getattr(raw, "_backend", NO_ENGINE)
+        if backend == NO_ENGINE != own:
+            raise FieldError("backend", backend, f"auto, {', '.join(BACKENDS)}", "is for environments without physics")
         _check_runs(raw, name)
         return brax_like.make_environment(
             _Quiet(raw), f"brax:{name}", own, obs_noise, episode_steps, model, lambda state: state.pipeline_state.q

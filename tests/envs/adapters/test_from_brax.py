@@ -100,6 +100,12 @@ def test_a_state_that_is_changed_in_place_does_not_leak():
     np.testing.assert_array_equal(rows.next_obs[:, 0], np.cumsum(np.arange(1, 9)))
 
 
+def test_a_saved_backend_makes_the_same_environment_again():
+    # what a run writes down is what its backend turned out to be
+    toy = envs.make("brax:fast")
+    assert envs.make("brax:fast", backend=toy.backend).backend == toy.backend == "jax"
+
+
 @pytest.mark.slow
 def test_what_an_environment_becomes():
     hopper = envs.make("brax:hopper", backend="spring")
@@ -119,6 +125,11 @@ def test_what_an_environment_becomes():
             r"are brax:hopper(, brax:\w+){4}\.$",
         ),
         ("brax:swimmer", {}, r"cannot be stepped by this version of Brax and JAX: it raised TypeError: .*Allowed: env"),
+        (
+            "brax:inverted_pendulum",
+            {"backend": "jax"},
+            r"backend='jax' is for environments without physics\. Allowed: auto",
+        ),
         ("brax:fast", {"backend": "mujoco"}, r"backend='mujoco' is not known\. Allowed: auto, generalized, mjx"),
         ("brax:fast", {"episode_steps": 0}, "episode_steps=0 is out of range"),
         ("brax:fast", {"obs_noise": -1.0}, r"obs_noise=-1\.0 is out of range"),
