@@ -2,6 +2,7 @@
 
 Format 0, until November 2026: m stood twice (`imagination.num_models` beside `svgd.num_particles`, and for static
 networks alone), and `imagination` also configured methods that imagine nothing.
+Format 1, of that month: a belief had one generator, and its features were ReLU's.
 """
 
 import copy
@@ -18,6 +19,9 @@ MOVED = {
 }
 """Fields of the explorer that format 0 had -> where they are now."""
 
+OLD_GENERATOR = {"noise_size", "hidden", "noise", "init_std", "constant_fraction", "bias_std"}
+"""Fields of a generator before format 2."""
+
 
 def upgrade(data: Mapping[str, Any], start: RunConfig, found: int) -> dict[str, Any]:
     """The fields of a configuration of format `found`, as today's format has them.
@@ -32,13 +36,25 @@ def upgrade(data: Mapping[str, Any], start: RunConfig, found: int) -> dict[str, 
     """
     data = copy.deepcopy(dict(data))
     explorer = data.get("explorer")
-    if found > 0 or not isinstance(explorer, dict):
+    if not isinstance(explorer, dict):
+        return data
+    if found < 2:
+        _upgrade_generator(explorer)
+    if found > 0:
         return data
     imagination = explorer.get("imagination", {})
     if isinstance(imagination, dict):
         _upgrade_models(explorer, imagination, start)
         _upgrade_reactive(explorer, imagination, start)
     return data
+
+
+def _upgrade_generator(explorer: dict[str, Any]) -> None:
+    """There was one generator, of ReLU features as they came, whatever a preset has now."""
+    generator = explorer.get("generator")
+    # One that a person has written names some of its fields, and leaves the rest to the preset.
+    if isinstance(generator, dict) and OLD_GENERATOR <= generator.keys():
+        explorer["generator"] = {"activation": "relu", "normalize": False, "num_generators": 1, **generator}
 
 
 def _upgrade_models(explorer: dict[str, Any], imagination: dict[str, Any], start: RunConfig) -> None:

@@ -216,8 +216,22 @@ def test_a_saved_configuration_names_every_field():
 
     saved = json.loads(to_json(RunConfig()))
     assert (
-        {saved.pop("format"), saved.pop("parent")} == {1, None}
+        {saved.pop("format"), saved.pop("parent")} == {2, None}
         and saved.pop("imports") == []
         and len(saved.pop("identity")) == 16
     )
     assert keys(saved) == paths(RunConfig())
+
+
+def test_a_generator_of_before_there_were_settings_for_it_is_what_it_was():
+    # whatever the preset has now; a file that leaves fields out leaves them to the preset
+    saved = json.loads(to_json(RunSpec(RunConfig())))
+    saved["format"] = 1
+    generator = saved["explorer"]["generator"]
+    for field in ("activation", "normalize", "num_generators"):
+        del generator[field]
+    old = from_json(json.dumps(saved), "c.json").config.explorer.generator
+    assert (old.activation, old.normalize, old.num_generators) == ("relu", False, 1)
+    partial = from_json('{"format": 1, "explorer": {"generator": {"noise_size": 8}}}', "c.json").config
+    preset = preset_config("laptop").explorer.generator
+    assert partial.explorer.generator == dataclasses.replace(preset, noise_size=8)
