@@ -53,7 +53,7 @@ def _upgrade_generator(explorer: dict[str, Any]) -> None:
     """There was one generator, of ReLU features as they came, whatever a preset has now."""
     generator = explorer.get("generator")
     # One that a person has written names some of its fields, and leaves the rest to the preset.
-    if isinstance(generator, dict) and OLD_GENERATOR <= generator.keys():
+    if isinstance(generator, dict) and generator.keys() >= OLD_GENERATOR:
         explorer["generator"] = {"activation": "relu", "normalize": False, "num_generators": 1, **generator}
 
 

@@ -225,13 +225,13 @@ def test_a_saved_configuration_names_every_field():
 
 def test_a_generator_of_before_there_were_settings_for_it_is_what_it_was():
     # whatever the preset has now; a file that leaves fields out leaves them to the preset
-    saved = json.loads(to_json(RunSpec(RunConfig())))
+    saved = json.loads(spec.to_json(RunSpec(RunConfig())))
     saved["format"] = 1
     generator = saved["explorer"]["generator"]
     for field in ("activation", "normalize", "num_generators"):
         del generator[field]
-    old = from_json(json.dumps(saved), "c.json").config.explorer.generator
+    old = spec.from_json(json.dumps(saved), "c.json").config.explorer.generator
     assert (old.activation, old.normalize, old.num_generators) == ("relu", False, 1)
-    partial = from_json('{"format": 1, "explorer": {"generator": {"noise_size": 8}}}', "c.json").config
+    partial = spec.from_json('{"format": 1, "explorer": {"generator": {"noise_size": 8}}}', "c.json").config
     preset = preset_config("laptop").explorer.generator
     assert partial.explorer.generator == dataclasses.replace(preset, noise_size=8)
