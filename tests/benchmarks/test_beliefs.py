@@ -1,5 +1,6 @@
 """The testbed of beliefs: known answers of its measures, and a belief that it can tell from a better one."""
 
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -63,7 +64,7 @@ def test_a_kind_is_judged_by_hand():
     assert found.rank == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("name", ["ant_maze", "acrobot", "half_cheetah"])
+@pytest.mark.parametrize("name", ["ant_maze", "acrobot"])
 def test_what_is_stored_is_three_kinds_of_one_environment(name: str):
     stored = transitions.load(name)
     assert name in transitions.names()
@@ -106,9 +107,13 @@ def test_bad_words_are_refused(words: str, message: str, capsys: pytest.CaptureF
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ant_maze", "acrobot", "half_cheetah"])
-def test_no_feature_of_the_laptops_generator_dies(name: str):
-    # after as many steps as a run of 4,000 in the maze comes to; of the paper's ReLU features more than half do
-    config = preset_config("laptop", name).explorer
-    found = beliefs.verdict(name, "implicit", config, beliefs.STEPS, 0)
-    assert found.metrics["dead_features"] == 0.0
+def test_tanh_features_live_where_the_papers_die():
+    # after as many gradient steps as a run of 4,000 in the maze comes to, on its data: measured 0 and 90 %
+    config = preset_config("laptop", "ant_maze").explorer
+    dead = {}
+    for activation in ("tanh", "relu"):
+        generator = dataclasses.replace(config.generator, activation=activation)
+        own = dataclasses.replace(config, generator=generator)
+        dead[activation] = beliefs.verdict("ant_maze", "implicit", own, beliefs.STEPS, 0).metrics["dead_features"]
+    assert dead["tanh"] == 0.0
+    assert dead["relu"] > 0.5
