@@ -190,9 +190,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             if command.version:
                 print("\n".join(f"{name} {version}" for name, version in runtime.versions().items()))
                 return 0
-            env, agent, programs, spec = prepare(spec, resume=command.resume)
+            env, agent, spec = prepare(spec, resume=command.resume)
             check_read(argv, spec.config, build.sizes_of(env))
             chosen = place.choose(command.out, spec, resume=command.resume)
+            programs = make_programs_that_fit(spec.config, env, agent, resume=command.resume)
         except (ValueError, RunError) as error:
             print(f"error: {error}", file=sys.stderr)
             process.show_cause(error, debug=debug)
@@ -210,9 +211,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return process.status_of(stop)
 
 
-def prepare(spec: RunSpec, *, resume: bool) -> tuple[Environment, Explorer, Programs, RunSpec]:
-    """Environment, agent and programs, which refuse what they cannot do when they are built: before anything is
-    written.
+def prepare(spec: RunSpec, *, resume: bool) -> tuple[Environment, Explorer, RunSpec]:
+    """Environment and agent, which refuse what they cannot do when they are built: before anything is written.
 
     A run that is resumed has its parent's policy in its checkpoints.
 
@@ -228,13 +228,23 @@ def prepare(spec: RunSpec, *, resume: bool) -> tuple[Environment, Explorer, Prog
         agent = build.make_agent(spec.config, env)
         if spec.parent is not None and not resume:
             spec = dataclasses.replace(spec, parent=parent.resolve(spec.parent, env, agent))
-        memory.check_steps(spec.config)
-        programs = make_programs(spec.config, env, agent)
-        memory.check_arrays(spec.config, env, programs)
-        return env, agent, programs, spec
+        return env, agent, spec
     except FieldError as error:
         path = "parent" if error.field == "parent" else path_of(spec.config, error)
         raise ValueError(error.spell(flag(path)) if path else str(error)) from error
+
+
+def make_programs_that_fit(config: RunConfig, env: Environment, agent: Explorer, *, resume: bool) -> Programs:
+    """The programs of a run. One that does not fit into memory is refused; what is resumed has fitted before.
+
+    Raises:
+        ValueError: it does not fit; names the sizes.
+    """
+    memory.check_steps(config)
+    programs = make_programs(config, env, agent)
+    if not resume:
+        memory.check_arrays(config, env, programs)
+    return programs
 
 
 def carry_out(

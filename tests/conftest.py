@@ -3,8 +3,10 @@
 Warnings are errors too; `pyproject.toml` says so, and which of other packages' warnings are let through.
 """
 
+import contextlib
 import gc
 import os
+import signal
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
@@ -30,6 +32,12 @@ import experiments  # noqa: F401  (sets switches of JAX's for the tests of the l
 # Not through the environment: a command under test should see the devices that a user's command sees.
 jax.config.update("jax_num_cpu_devices", 2)
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+# What is started in the background of a shell ignores Ctrl-C, and so would the commands that tests start and interrupt.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    with contextlib.suppress(ValueError):  # not in the main thread
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(autouse=True, scope="module")
