@@ -18,9 +18,9 @@ from scipy import stats
 
 from benchmarks import gaussian_process, transitions
 from benchmarks.transitions import Stored
-from experiments import process, run, runtime
+from experiments import process, runtime
 from experiments.analysis.tables import number, text_table
-from experiments.runs import flags
+from experiments.runs import command, flags
 from experiments.runs.errors import RunError
 from jaxplore import dynamics, replay
 from jaxplore.beliefs.base import Belief
@@ -177,7 +177,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 0
         data, steps, fits, path, rest = parse(argv)
         runtime.use_compilation_cache()
-        config = run.parse(rest)[1].config
+        config = command.parse(rest)[1].config
         verdicts, known = [], []
         for seed in range(fits):
             for name in data:

@@ -1,181 +1,26 @@
 """The command line: `python -m experiments.run --env=ant_maze`."""
 
 import dataclasses
-import os
 import shlex
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
 
 import jax
 
-import envs
-from envs.base import ENGINES, Environment
+from envs.base import Environment
 from experiments import process, runtime
 from experiments.analysis import report
-from experiments.runs import flags, modules, place
-from experiments.runs.config import RunConfig, flag, path_of, replace
+from experiments.runs import place
+from experiments.runs.command import PROGRAM, CommandLine, check_read, parse
+from experiments.runs.config import RunConfig, flag, path_of
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
-from experiments.runs.presets import preset_config
-from experiments.runs.spec import RunRef, RunSpec, from_json
+from experiments.runs.spec import RunSpec
 from experiments.runs.status import Status
-from experiments.runs.upgrades import MOVED
 from experiments.training import build, loop, memory, parent
 from experiments.training.programs import Programs, make_programs
-from jaxplore.config import Sizes
 from jaxplore.exploration import Explorer
-from jaxplore.methods import METHODS, SHARED
-from jaxplore.networks import ACTIVATIONS, INITIALIZERS
 from jaxplore.validate import FieldError
-
-PROGRAM = "python -m experiments.run"
-DESCRIPTION = "Explore an environment by a belief's own uncertainty, and draw what was seen."
-NOTES = f"--import=MODULE: {modules.HELP}."
-
-
-@dataclass(frozen=True)
-class CommandLine:
-    """What the program does beside the run itself."""
-
-    out: str | None = None
-    """Directory of the run. By default a new one: runs/ENV-METHOD-PRESET-seedN."""
-    resume: bool = False
-    """Continue the run in --out from its latest checkpoint; with more steps, make it that much longer."""
-    config: str | None = None
-    """A config.json to start from, as every run saves it; other flags come on top."""
-    parent: str | None = None
-    """Start from the policy of another run: DIRECTORY or DIRECTORY@STEP (by default its latest checkpoint). Its
-    observation statistics come with it; critics are new and there are no data. For methods on the task's reward."""
-    wandb: str | None = None
-    """Also log to this project of Weights & Biases; WANDB_MODE=offline keeps it on this machine."""
-    debug: bool = False
-    """Show the traceback below the message of an error."""
-    version: bool = False
-    """Print the versions of everything that results depend on, and stop."""
-
-
-def parse(argv: Sequence[str]) -> tuple[CommandLine, RunSpec]:
-    """What a command line asks for.
-
-    Args:
-        argv: the words after the program's name.
-
-    Returns:
-        The invocation and the run: the preset's (or `--config`'s, or with `--resume` the saved one), changed by the
-        flags.
-
-    Raises:
-        ValueError: bad input, with the field, the value and what is allowed.
-        RunError: `--config` or the run to resume cannot be read, or a module cannot be imported.
-        SystemExit: `--help`, or a flag that does not exist.
-    """
-    named, argv = modules.take(argv)
-    named += modules.of_env(flags.option(argv, "env"))
-    modules.load(named)
-    start = _start(argv)
-    method = METHODS[start.config.method]
-    layout = flags.Layout(
-        unprefixed=["explorer"],
-        choices={
-            "env": [*envs.FACTORIES, *(f"{package}:NAME" for package in envs.ADAPTERS)],
-            "method": list(METHODS),
-            "backend": ["auto", *ENGINES],
-            "activation": list(ACTIVATIONS),
-            "init": list(INITIALIZERS),
-        },
-        first=method.reads(start.config.explorer),
-        moved={flag(f"explorer.{old}"): new for old, new in MOVED.items()},
-    )
-    if "-h" in argv or "--help" in argv:
-        print(flags.brief((start.config, CommandLine()), PROGRAM, DESCRIPTION, layout, NOTES))
-        raise SystemExit(0)
-    description = (
-        f"{DESCRIPTION}\n\n"
-        "The defaults below are those of the preset; --preset=paper --help=all shows the paper's.\n\n"
-        f"Settings that {start.config.method} reads come first; one that the chosen method does not read is "
-        f"refused.\n\n{NOTES}"
-    )
-    words = ["--help" if word == "--help=all" else word for word in argv]
-    command, changes = flags.parse(
-        words, (CommandLine(), start.config), prog=PROGRAM, description=description, layout=layout
-    )
-    paths = {name: command[name] or None for name in ("out", "config", "parent", "wandb")}
-    try:
-        ref = RunRef.parse(paths["parent"]) if paths["parent"] else start.parent
-        config: RunConfig = replace(start.config, changes)
-        check_read(argv, config)
-    except FieldError as error:
-        raise ValueError(error.spell(flag(error.field))) from error
-    imports = tuple(dict.fromkeys((*start.imports, *named)))
-    return CommandLine(**{**command, **paths}), RunSpec(config, ref, imports)
-
-
-def _start(argv: Sequence[str]) -> RunSpec:
-    """The run that the other flags change."""
-    given = {name: flags.option(argv, name) for name in ("out", "config", "preset", "env", "method")}
-    known = given["method"] if given["method"] in METHODS else None
-    saved = Path(str(given["out"])) / "config.json"
-    if given["out"] and given["config"] is None and "--resume" in argv and os.path.exists(saved):
-        spec, source, settled = RunDirectory(str(given["out"])).spec(), str(saved), ("preset",)
-    elif given["config"] is not None:
-        spec, source, settled = _read(Path(given["config"]), known), given["config"], ("preset", "method")
-    else:
-        # One that is not known is refused with the other flags.
-        preset, env = given["preset"] or "laptop", given["env"] or "ant_maze"
-        return RunSpec(preset_config(preset, env, known or "implicit"))
-    # Other settings hang on these, and the file has settled them.
-    for name in settled:
-        if given[name] is not None and given[name] != getattr(spec.config, name):
-            has = getattr(spec.config, name)
-            raise ValueError(f"--{name}={given[name]} disagrees with {source}, which has {has!r}. Give one.")
-    return spec
-
-
-def _read(path: Path, method: str | None) -> RunSpec:
-    try:
-        return from_json(path.read_text(), str(path), method)
-    except (OSError, UnicodeDecodeError) as error:
-        raise RunError(f"cannot read the configuration {path}: {error}.") from error
-
-
-def check_read(argv: Sequence[str], config: RunConfig, sizes: Sizes | None = None) -> None:
-    """Refuse a flag that the chosen method does not read: it would do nothing.
-
-    Args:
-        argv: the words after the program's name.
-        config: what they come to.
-        sizes: of the environment, where it has been made: whether actions are discrete decides on the learner.
-
-    Raises:
-        ValueError: names the flag and the methods that read it.
-    """
-    explorer, method = config.explorer, METHODS[config.method]
-    fields = {item.name for item in dataclasses.fields(explorer)}
-    for name in flags.given(argv):
-        field = name.partition(".")[0]
-        if field not in fields or field in method.reads(explorer, sizes):
-            continue
-        if sizes is not None:
-            kind = "discrete" if sizes.discrete else "numbers"
-            others = [known for known in method.reads(explorer, sizes) - set(SHARED) if hasattr(explorer, known)]
-            raise ValueError(
-                f"--{name.replace('_', '-')} does nothing with method={config.method!r} in {config.env}, where actions "
-                f"are {kind}. Allowed: settings of {', '.join(sorted(others))}."
-            )
-        variants = [dataclasses.replace(explorer, planner=planner) for planner in ("sac", "mcts")]
-        reading = [known for known, row in METHODS.items() if any(field in row.reads(one) for one in variants)]
-        if config.method in reading:
-            other = next(one.planner for one in variants if field in method.reads(one))
-            raise ValueError(
-                f"--{name.replace('_', '-')} does nothing with --planner={explorer.planner}. "
-                f"Allowed: with --planner={other}."
-            )
-        raise ValueError(
-            f"--{name.replace('_', '-')} does nothing with method={config.method!r}, which does not read it. "
-            f"Allowed: with one of the methods {', '.join(reading)}."
-        )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
