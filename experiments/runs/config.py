@@ -145,6 +145,9 @@ def path_of(config: RunConfig, error: FieldError) -> str | None:
                 return f"{prefix}{item.name}"
         return None
 
+    # An environment refuses an option of its own by name, as any function does.
+    if not error.owner and error.field in {item.name for item in dataclasses.fields(config)}:
+        return error.field
     return search(config, "")
 
 

@@ -83,8 +83,8 @@ class GradientPolicyConfig:
         checks.in_range("discount", 0.0, 1.0)
         for field in ("policy_penalty", "bound"):
             checks.in_range(field, 0.0)
+        checks.in_range("log_std_max", high=10.0)
         checks.in_range("log_std_min", high=self.log_std_max)
-        checks.in_range("log_std_max", self.log_std_min, 10.0)
 
 
 @struct.dataclass

@@ -7,7 +7,7 @@ import gymnasium
 import pytest
 
 from experiments import run
-from tests.experiments.tiny import STEPS, TINY, tiny_flags
+from tests.experiments.tiny import GROUPS, RUN, STEPS, TINY, tiny_flags
 
 pytestmark = pytest.mark.slow
 
@@ -31,7 +31,22 @@ GYMNASIUM = (
 )
 MAY_BE_REFUSED = ("Blackjack-v1", "Pusher-v4", *BOX2D)
 """A tuple for observations, an old MuJoCo, pictures, and a package that may not be there."""
-REFUSED = ("cannot be made here", "has observations", "has actions", "does not fit", "needs", "acts by numbers")
+DISCRETE = (*RUN, *(word for group in ("dynamics", "generator", "svgd", "fit", "ddqn") for word in GROUPS[group]))
+TABULAR = (
+    *RUN,
+    *(word for group in ("dynamics", "generator", "svgd", "fit") for word in GROUPS[group]),
+    *("--planner=mcts", "--dynamics.target=one_hot", "--mcts.num-iterations=6", "--mcts.num-trajectories=2"),
+)
+REFUSED = (
+    "where actions are discrete",
+    "Allowed: planner='mcts'",
+    *"cannot be made here",
+    "has observations",
+    "has actions",
+    "does not fit",
+    "needs",
+    "acts by numbers",
+)
 
 
 def outcome(name: str, out: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...]) -> str:
@@ -78,6 +93,10 @@ def test_there_are_enough_of_gymnasium():
 @pytest.mark.parametrize("name", GYMNASIUM)
 def test_gymnasium(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     found = outcome(f"gymnasium:{name}", tmp_path / "run", capsys, TINY)
+    # What a belief on choices, or on a table of states, learns by has settings of its own.
+    for said, words in (("where actions are discrete", DISCRETE), ("Allowed: planner='mcts'", TABULAR)):
+        if said in found:
+            found = outcome(f"gymnasium:{name}", tmp_path / "run", capsys, words)
     if "such as random" in found:
         # No belief fits it: uniform actions do.
         found = outcome(f"gymnasium:{name}", tmp_path / "run", capsys, ("--method=random", *tiny_flags("random")))
