@@ -39,6 +39,7 @@ from jaxplore.beliefs import (
     make_generator,
     make_generator_belief,
     make_no_belief,
+    state_shardings,
     stein_direction,
 )
 from jaxplore.config import ExplorationConfig, Sizes
@@ -131,5 +132,6 @@ __all__ = [
     "replay",
     "rewards",
     "rollout",
+    "state_shardings",
     "stein_direction",
 ]

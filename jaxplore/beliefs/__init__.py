@@ -4,6 +4,7 @@ from jaxplore.beliefs.base import Belief, FitConfig, Judgement, fit, make_no_bel
 from jaxplore.beliefs.ensemble import EnsembleConfig, make_ensemble_belief
 from jaxplore.beliefs.generator import Generator, GeneratorConfig, make_generator
 from jaxplore.beliefs.implicit import make_generator_belief
+from jaxplore.beliefs.sharding import state_shardings
 from jaxplore.beliefs.svgd import AmortizedSVGD, SVGDConfig, make_amortized_svgd, stein_direction
 
 __all__ = [
@@ -22,5 +23,6 @@ __all__ = [
     "make_generator_belief",
     "make_no_belief",
     "make_optimizer",
+    "state_shardings",
     "stein_direction",
 ]

@@ -1,0 +1,55 @@
+"""A belief's state over several devices."""
+
+import jax
+import numpy as np
+import pytest
+from jax.sharding import Mesh, PartitionSpec
+
+from jaxplore.beliefs.sharding import state_shardings
+from jaxplore.validate import FieldError
+from tests import devices
+
+
+@pytest.fixture(scope="module")
+def mesh():
+    return Mesh(np.array(jax.devices()[:2]), ("rows",))
+
+
+@pytest.mark.parametrize(
+    ("shape", "spec"),
+    [
+        ((20_000, 65), ("rows",)),  # a head
+        ((65, 20_000), (None, "rows")),  # the other way round
+        ((4, 20_000, 65), (None, "rows")),  # those of four generators
+        ((20_001, 64), (None, "rows")),  # two devices do not divide its longest axis
+        ((20_001, 65), ()),  # nor any other
+        ((64, 64), ()),  # features: not worth it
+        ((), ()),
+    ],
+)
+def test_large_leaves_are_split_along_their_longest_axis(mesh, shape, spec):
+    state = {"leaf": jax.ShapeDtypeStruct(shape, np.float32)}
+    found = state_shardings(state, mesh)["leaf"]
+    assert (found.mesh, found.spec) == (mesh, PartitionSpec(*spec))
+
+
+def test_an_axis_of_the_mesh_is_named_or_the_only_one():
+    leaf = jax.ShapeDtypeStruct((40_000,), np.float32)
+    grid = Mesh(np.array(jax.devices()[:2]).reshape(1, 2), ("seed", "rows"))
+    assert state_shardings(leaf, grid, "rows").spec == PartitionSpec("rows")
+    with pytest.raises(FieldError, match=r"axis=None .*Allowed: one of seed, rows"):
+        state_shardings(leaf, grid)
+    with pytest.raises(FieldError, match=r"axis='row'.*Allowed: one of seed, rows"):
+        state_shardings(leaf, grid, "row")
+
+
+def test_eight_devices_hold_an_eighth_each_and_learn_as_one_does():
+    found = devices.result(devices.start("tests.jaxplore.beliefs.on_eight_devices", num_devices=8))
+    # the 64 x 64 weights of the middle layer, from 16 features and their constant
+    assert [[4096, 17], [512, 17]] in found["1"]["parts"]
+    assert [[2, 4096, 17], [2, 512, 17]] in found["2"]["parts"]
+    for belief in found.values():
+        assert belief["memory"] > 7.5  # of 8: features lie everywhere
+        assert belief["laid_out"]
+        assert belief["metrics"] < 1e-5
+        assert belief["moment"] < 1e-5
