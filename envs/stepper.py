@@ -6,7 +6,7 @@ environment outside of runs needs `make_walk` or `prepared`.
 
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -170,6 +170,11 @@ ActAs: TypeAlias = Callable[[Key, Any, Array], Array]
 """`act(key, actor, obs [O]) -> action [A]`; the actor says how it acts."""
 
 
+Spread: TypeAlias = Callable[..., Callable[..., Any]]
+"""`spread(function, shared=()) -> function`: the same, with arguments `[S, ...]` but for those in the places `shared`,
+computed where the caller wants it."""
+
+
 class Stepper(NamedTuple):
     """Copies of one environment, `S` of them, stepped side by side by an actor each."""
 
@@ -188,7 +193,12 @@ class Stepper(NamedTuple):
     """`abstract(init) -> state`: what to restore a saved `init()` into, without computing it where that is possible."""
 
 
-def make_stepper(env: Environment, capacity: int, act: ActAs) -> Stepper:
+def nowhere_else(function: Callable[..., Any], shared: Collection[int] = ()) -> Callable[..., Any]:
+    """`Spread` on one device: the function itself."""
+    return function
+
+
+def make_stepper(env: Environment, capacity: int, act: ActAs, spread: Spread = nowhere_else) -> Stepper:
     """What a run needs of its environment, on the device or on the host. Nothing is compiled yet.
 
     On the device, all steps of all agents are one program, whatever `num_steps` is. On the host, all agents act in one
@@ -198,6 +208,7 @@ def make_stepper(env: Environment, capacity: int, act: ActAs) -> Stepper:
         env: the environment.
         capacity: rows that `collect` returns; `num_steps` of them are steps, the others zeros.
         act: how an actor chooses its action.
+        spread: how programs on the device are spread over several of them.
 
     Returns:
         A `Stepper`. Each agent's numbers are those that it would have alone, but on the device for rounding: there a
@@ -209,8 +220,10 @@ def make_stepper(env: Environment, capacity: int, act: ActAs) -> Stepper:
     env = _checked(env)
     if env.compiled:
         return Stepper(
-            init=jax.jit(jax.vmap(env.reset)),
-            collect=jax.jit(functools.partial(_collect_on_device, make_collect(env, capacity), act)),
+            init=jax.jit(spread(jax.vmap(env.reset))),
+            collect=jax.jit(
+                spread(functools.partial(_collect_on_device, make_collect(env, capacity), act), shared=(3,))
+            ),
             obs=lambda env_state: env_state.obs,
             episode_step=lambda env_state: jax.device_get(env_state.num_steps),
             compiles=True,

@@ -23,15 +23,16 @@ def make_evaluate(config: RunConfig, env: Environment, explorer: Explorer, progr
 
     All episodes of all seeds run side by side, each for the longest that an episode can take.
     """
-    stepper = make_stepper(env, env.spec.episode_steps, explorer.act_greedily)
-    num = config.eval_episodes
+    spread, num = programs.stepping.spread, config.eval_episodes
+    stepper = make_stepper(env, env.spec.episode_steps, explorer.act_greedily, spread)
 
     @jax.jit
+    @spread
     def split(keys: jax.Array) -> tuple[jax.Array, jax.Array]:
         own = jax.vmap(lambda key: jax.random.split(key, 2 * num))(keys)
         return own[:, :num].reshape(-1), own[:, num:].reshape(-1)
 
-    repeat = jax.jit(lambda actors: jax.tree.map(lambda leaf: jnp.repeat(leaf, num, axis=0), actors))
+    repeat = jax.jit(spread(lambda actors: jax.tree.map(lambda leaf: jnp.repeat(leaf, num, axis=0), actors)))
 
     def evaluate(step: int, state: ExplorerState) -> dict[str, np.ndarray]:
         start_keys, act_keys = split(programs.keys(EVALUATE, step))

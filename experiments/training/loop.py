@@ -139,6 +139,8 @@ class Session:
             num_cells=self.env.coverage.num_cells,
             warm_up=self.config.explorer.warm_up_steps,
         )
+        if (count := self.programs.learning.num_devices) > 1:
+            self.progress.say(f"The seeds are spread over {count} devices")
         if resume:
             known = f"Continuing from step {self.step:,}" if restored else "There is no checkpoint yet: starting over"
             self.progress.say(known)

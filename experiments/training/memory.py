@@ -31,6 +31,8 @@ def check_steps(config: RunConfig) -> None:
 def check_arrays(config: RunConfig, env: Environment, programs: Programs) -> None:
     """Refuse a run whose state, or an array that a step of learning makes, is larger than the machine.
 
+    Seeds that are spread over devices, each with a memory of its own, share the state.
+
     Both programs are traced for that as they are in the run, which then does not trace them again.
 
     Raises:
@@ -42,7 +44,8 @@ def check_arrays(config: RunConfig, env: Environment, programs: Programs) -> Non
     except (OverflowError, MemoryError) as error:
         raise _no_machine(config) from error
     leaves = jax.tree.leaves(state)
-    need, largest = sum(map(_bytes, leaves)), max(leaves, key=_bytes)
+    share = 1 if jax.devices()[0].platform == "cpu" else programs.learning.num_devices
+    need, largest = sum(map(_bytes, leaves)) // share, max(leaves, key=_bytes)
     if need > memory:
         raise _refusal(need, memory, f"arrays such as {_name(largest)}", _settings(config, largest.shape))
     shape = (config.num_seeds, config.explorer.steps_per_round)
@@ -50,10 +53,10 @@ def check_arrays(config: RunConfig, env: Environment, programs: Programs) -> Non
     obs = jax.ShapeDtypeStruct((config.num_seeds, env.spec.obs_size), np.float32)
     valid, alive = (jax.ShapeDtypeStruct(dims, bool) for dims in (shape, shape[:1]))
     try:
-        jaxpr = programs.trace_learn(state, (rows, valid), obs, config.steps, alive)
+        traced = programs.trace_learn(state, (rows, valid), obs, config.steps, alive)
     except (OverflowError, MemoryError) as error:
         raise _no_machine(config) from error
-    largest = max(_arrays(jaxpr), key=_bytes)
+    largest = max(_arrays(traced.jaxpr), key=_bytes)
     if _bytes(largest) > memory:
         raise _refusal(_bytes(largest), memory, f"an array {_name(largest)}", _settings(config, largest.shape))
 
@@ -71,7 +74,8 @@ def total_memory() -> int:
 def _arrays(jaxpr: Any) -> Iterator[Any]:
     """Every array that a program makes, those of the programs within it included."""
     for equation in jaxpr.eqns:
-        yield from (variable.aval for variable in equation.outvars if hasattr(variable.aval, "shape"))
+        if equation.primitive.name != "shard_map":  # Whose results are those of all devices together.
+            yield from (variable.aval for variable in equation.outvars if hasattr(variable.aval, "shape"))
         for part in jax.tree.leaves(list(equation.params.values()), is_leaf=lambda part: hasattr(part, "eqns")):
             inner = getattr(part, "jaxpr", part)
             if hasattr(inner, "eqns"):

@@ -82,5 +82,10 @@ def adopt(state: RunState, ref: RunRef, agent: Explorer) -> RunState:
     def pick(leaf: Array) -> Array:
         return jnp.asarray(leaf)[index]
 
+    def put(new: Array, old: Array) -> Array:
+        # What is new and the same for all seeds would lie on every device.
+        return jax.device_put(new, old.sharding) if len(old.sharding.device_set) > 1 else new
+
     parents = jax.tree.map(pick, parent_state.explorer)
-    return dataclasses.replace(state, explorer=jax.jit(jax.vmap(one))(state.explorer, parents))
+    adopted = jax.jit(jax.vmap(one))(state.explorer, parents)
+    return dataclasses.replace(state, explorer=jax.tree.map(put, adopted, state.explorer))

@@ -1,4 +1,4 @@
-"""The functions that a run calls: jitted, over all its seeds side by side.
+"""The functions that a run calls: jitted, over all its seeds side by side, spread over the devices that there are.
 
 All randomness follows from the seed, the purpose and the step, so a run that is resumed is the run that was never
 interrupted.
@@ -19,6 +19,7 @@ from envs.functional import all_finite
 from envs.stepper import Stepper, make_stepper
 from experiments.runs.codec import Allowances
 from experiments.runs.config import RunConfig
+from experiments.training.placement import Placement, place
 from jaxplore.exploration import Actor, Explorer, ExplorerState
 from jaxplore.types import Array, Key, Metrics, Transition
 
@@ -67,35 +68,45 @@ class Programs(NamedTuple):
     trace_init: Callable[[], ExplorerState]
     """The explorers' part of the first state, as shapes."""
     trace_learn: Callable[..., Any]
-    """`trace_learn(state, (transitions, valid), obs, num_data, alive) -> jaxpr` of `learn`, which is then not traced
-    again; shapes do."""
+    """`trace_learn(state, (transitions, valid), obs, num_data, alive) -> jax.stages.Traced` of `learn`, which is then
+    not traced again; shapes do."""
     mark: Callable[[np.ndarray, Array, Array], Array]
     """`mark(visited [S, cells], obs [S, T, O], valid [S, T]) -> visited`."""
     keys: Callable[[int, int], Key]
     """`keys(purpose, step) -> keys [S]`."""
     stepper: Stepper
+    learning: Placement
+    """Where the seeds learn."""
+    stepping: Placement
+    """Where they act and environments step: the same devices, or one if the environment is on the host."""
 
 
 def make_programs(config: RunConfig, env: Environment, explorer: Explorer) -> Programs:
     """Build the functions of a run. Nothing is compiled yet."""
     seed_keys = jax.vmap(jax.random.key)(jnp.arange(config.seed, config.seed + config.num_seeds))
     keys = jax.jit(functools.partial(derive_keys, seed_keys))
-    stepper = make_stepper(env, config.explorer.steps_per_round, explorer.act)
-    init_all = jax.jit(jax.vmap(explorer.init))
-    learn_all = jax.jit(functools.partial(learn_side_by_side, explorer), donate_argnums=1)
+    learning = place(config.num_seeds)
+    stepping = learning if env.compiled else Placement()
+    stepper = make_stepper(env, config.explorer.steps_per_round, explorer.act, stepping.spread)
+    init_all = jax.jit(learning.spread(jax.vmap(explorer.init)))
+    actors = jax.jit(learning.spread(jax.vmap(explorer.actor, in_axes=(0, None)), shared=(1,)))
+    learn_spread = learning.spread(functools.partial(learn_side_by_side, explorer), shared=(4,))
+    learn_all = jax.jit(learn_spread, donate_argnums=1)
     return Programs(
         init=functools.partial(init_state, config, env, init_all, stepper, keys),
-        actors=jax.jit(jax.vmap(explorer.actor, in_axes=(0, None))),
+        actors=actors if env.compiled else lambda *args: learning.gather(actors(*args)),
         collect=lambda step, *args: stepper.collect(keys(COLLECT, step), *args),
-        absorb=jax.jit(jax.vmap(explorer.observe), donate_argnums=0),
+        absorb=jax.jit(learning.spread(jax.vmap(explorer.observe)), donate_argnums=0),
         learn=lambda step, state, transitions, valid, *rest: learn_all(
             keys(LEARN, step), state, (transitions, valid), *rest
         ),
         trace_init=lambda: jax.eval_shape(init_all, jax.eval_shape(keys, INIT, 0)),
-        trace_learn=lambda *args: learn_all.trace(jax.eval_shape(keys, LEARN, 0), *args).jaxpr,
+        trace_learn=lambda *args: learn_all.trace(jax.eval_shape(keys, LEARN, 0), *args),
         mark=jax.jit(jax.vmap(functools.partial(mark_cells, env.coverage))),
         keys=keys,
         stepper=stepper,
+        learning=learning,
+        stepping=stepping,
     )
 
 
