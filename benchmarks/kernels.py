@@ -26,6 +26,7 @@ from jaxplore import (
     rewards,
     rollout,
 )
+from jaxplore.behaviours.base import lesson_of, no_learner_metrics, train
 from jaxplore.beliefs import Belief
 
 OBS, ACTION = 31, 8
@@ -84,16 +85,13 @@ def imagined_step(config: ExplorationConfig, rate: float) -> Result:
 
 
 def sac_update(config: ExplorationConfig, rate: float, inner: int) -> Result:
-    """One SAC update on a batch drawn from a replay."""
+    """One SAC update on a batch drawn from a replay, as a round makes many of them."""
     sac = make_sac(OBS, ACTION, config.sac)
-    data = random_data(8192, 8192)
+    lesson = lesson_of([(random_data(8192, 8192), config.sac.batch_size)], None, jnp.ones(()))
+    nothing = no_learner_metrics(sac, OBS, ACTION)
 
     def updates(state: Any) -> Any:
-        def update(i: jax.Array, state: Any) -> Any:
-            key = jax.random.key(i)
-            return sac.update(key, state, replay.sample(key, data, config.sac.batch_size))[0]
-
-        return jax.lax.fori_loop(0, inner, update, state)
+        return train(sac, jax.random.key(0), state, lesson, inner, nothing)[0]
 
     timing = measure_chain(jax.jit(updates, donate_argnums=0), sac.init(jax.random.key(0)), inner=inner)
     shape = f"{widths(config.sac.hidden)}, batch {config.sac.batch_size}"

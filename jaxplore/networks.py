@@ -4,6 +4,7 @@ distrax, with the probability library behind it, takes as long to import as JAX 
 action is drawn. Every network is unbatched-friendly: leading axes of the input pass through.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -41,8 +42,37 @@ INITIALIZERS = {
 lets through, `orthogonal_small` 0.01; `small_uniform` is within 0.003."""
 
 
+class Dense(nn.Module):
+    """A linear layer of several inputs side by side, into several outputs side by side.
+
+    `[..., I]` and `[..., J]` count as their concatenation, which is not made: what depends on one of them alone is
+    computed, and differentiated, alone. So are the outputs, where `sizes` names more than one.
+    """
+
+    sizes: tuple[int, ...]
+    init_name: str
+
+    @nn.compact
+    def __call__(self, *inputs: Array) -> tuple[Array, ...]:
+        """An array `[..., size]` for each of the sizes."""
+        widths = [one.shape[-1] for one in inputs]
+        kernel = self.param("kernel", INITIALIZERS[self.init_name](), (sum(widths), sum(self.sizes)))
+        bias = self.param("bias", nn.initializers.zeros_init(), (sum(self.sizes),))
+        outputs, column = [], 0
+        for size in self.sizes:
+            products, row, columns = [], 0, slice(column, column + size)
+            for one, width in zip(inputs, widths, strict=True):
+                products.append(one @ kernel[row : row + width, columns])
+                row += width
+            outputs.append(sum(products[1:], products[0]) + bias[columns].reshape(*(1,) * (inputs[0].ndim - 1), size))
+            column += size
+        return tuple(outputs)
+
+
 class MLP(nn.Module):
     """A multi-layer perceptron with a linear last layer: `[..., I] -> [..., output_size]`.
+
+    Several inputs are taken side by side, as if concatenated.
 
     Raises:
         ValueError: unknown `activation` or `init`, naming the nearest match.
@@ -64,6 +94,8 @@ class MLP(nn.Module):
     """Initialiser of the last layer, which no activation follows."""
     layer_norm: bool = False
     """Whether hidden layers are normalised (Ba et al. 2016) before their activation."""
+    num_outputs: int = 1
+    """Equal parts that the output comes in; more than one as a tuple."""
 
     def __post_init__(self) -> None:
         validate.one_of("activation", self.activation, ACTIVATIONS)
@@ -72,14 +104,16 @@ class MLP(nn.Module):
         super().__post_init__()
 
     @nn.compact
-    def __call__(self, x: Array) -> Array:
+    def __call__(self, *inputs: Array) -> Any:
         """Run the network."""
         for i, width in enumerate(self.hidden):
-            x = nn.Dense(width, kernel_init=INITIALIZERS[self.init_name](), name=f"hidden_{i}")(x)
+            (x,) = Dense((width,), self.init_name, name=f"hidden_{i}")(*inputs)
             if self.layer_norm:
                 x = nn.LayerNorm(name=f"norm_{i}")(x)
-            x = ACTIVATIONS[self.activation](x)
-        return nn.Dense(self.output_size, kernel_init=INITIALIZERS[self.output_init_name](), name="output")(x)
+            inputs = (ACTIVATIONS[self.activation](x),)
+        sizes = (self.output_size // self.num_outputs,) * self.num_outputs
+        outputs = Dense(sizes, self.output_init_name, name="output")(*inputs)
+        return outputs[0] if self.num_outputs == 1 else outputs
 
 
 class GaussianParams(NamedTuple):
@@ -107,16 +141,15 @@ class TanhGaussianPolicy(nn.Module):
     @nn.compact
     def __call__(self, obs: Array) -> GaussianParams:
         """Run the network."""
-        heads = MLP(self.hidden, 2 * self.action_size, self.activation, self.init_name, self.init_name, name="mlp")(obs)
-        mean, head = jnp.split(heads, 2, axis=-1)
+        inits = self.init_name, self.init_name
+        mlp = MLP(self.hidden, 2 * self.action_size, self.activation, *inits, num_outputs=2, name="mlp")
+        mean, head = mlp(obs)
         low, high = self.log_std_bounds
         return GaussianParams(mean, low + 0.5 * (high - low) * (jnp.tanh(head) + 1.0))
 
 
 def sample_tanh_gaussian(key: Key, params: GaussianParams) -> tuple[Array, Array]:
     """Draw an action and its log-density.
-
-    The pair comes out of one pass: a density recomputed from a saturated action is not finite (distrax issue 7).
 
     Args:
         key: consumed.
@@ -131,16 +164,22 @@ def sample_tanh_gaussian(key: Key, params: GaussianParams) -> tuple[Array, Array
         >>> action.shape, log_prob.shape
         ((2,), ())
     """
+    return tanh_gaussian_of(jax.random.normal(key, params.mean.shape), params)
+
+
+def tanh_gaussian_of(noise: Array, params: GaussianParams) -> tuple[Array, Array]:
+    """The action that standard normal noise `[..., A]` stands for, and its log-density; see `sample_tanh_gaussian`.
+
+    The pair comes out of one pass: a density recomputed from a saturated action is not finite (distrax issue 7).
+    """
     # The first call may be traced, and what a module makes at its import must not be.
     with jax.ensure_compile_time_eval(), jax.numpy_rank_promotion("allow"):
         import distrax
 
-    gaussian = distrax.MultivariateNormalDiag(params.mean, jnp.exp(params.log_std))
-    squashed = distrax.Transformed(gaussian, distrax.Block(distrax.Tanh(), 1))
-    # distrax adds its sample axis by rank promotion; callers may have forbidden that.
-    with jax.numpy_rank_promotion("allow"):
-        action, log_prob = squashed.sample_and_log_prob(seed=key)
-    return jnp.asarray(action), jnp.asarray(log_prob)
+    before = params.mean + jnp.exp(params.log_std) * noise
+    density = jnp.sum(-0.5 * noise**2 - 0.5 * math.log(2.0 * math.pi) - params.log_std, axis=-1)
+    action, log_slope = distrax.Block(distrax.Tanh(), 1).forward_and_log_det(before)
+    return jnp.asarray(action), density - jnp.asarray(log_slope)
 
 
 def tanh_mean(params: GaussianParams) -> Array:

@@ -102,9 +102,20 @@ def sample(key: Key, state: Replay[Record], batch_size: int) -> Record:
         FieldError: `batch_size` below 1, or an empty buffer. Traced, where nobody knows how many rows it holds, an
             empty one gives its zero rows.
     """
+    return take(state, choose(key, state, batch_size))
+
+
+def choose(key: Key, state: Replay[Record], batch_size: int) -> Array:
+    """Where the rows that `sample` draws are, int32 `[B]`; for many batches at once, under `vmap` over keys. Raises as
+    `sample`.
+    """
     validate.at_least("batch_size", batch_size, 1)
     if validate.known(state.size) and not np.any(np.asarray(state.size)):
         raise FieldError("size", 0, "a buffer with a row in it", "is all that the buffer holds")
     # randint, not choice(replace=False): the latter sorts the whole capacity at each draw.
-    index = jax.random.randint(key, (batch_size,), 0, jnp.maximum(state.size, 1))
+    return jax.random.randint(key, (batch_size,), 0, jnp.maximum(state.size, 1))
+
+
+def take(state: Replay[Record], index: Array) -> Record:
+    """The rows at `index [B]`, `[B, ...]`."""
     return jax.tree.map(lambda rows: rows[index], state.rows)

@@ -5,7 +5,7 @@ action for the real environment.
 """
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -19,6 +19,8 @@ from jaxplore.replay import Replay
 from jaxplore.signals.base import Score
 from jaxplore.types import Array, Key, Metrics, Transition, no_metrics
 
+DRAWN_AHEAD = 64
+"""Updates whose random numbers are drawn at once, at most, to bound memory."""
 LABEL_CHUNK = 1024
 """Real transitions are given their intrinsic reward this many at a time, to bound memory."""
 
@@ -117,31 +119,72 @@ def label(belief: Belief, score: Score, experience: Experience) -> Replay[Transi
 class Lesson(NamedTuple):
     """What a learner is trained on."""
 
-    draw: Callable[[Key], Transition]
-    """`draw(key) -> batch [B, ...]`."""
+    choose: Callable[[Key], Any]
+    """`choose(key) -> choice`: which rows a batch has."""
+    take: Callable[[Any], Transition]
+    """`take(choice) -> batch [B, ...]`."""
     normalizers: Normalizers | None
     """What observations are normalised with. None: they stay as they are."""
     reward_std: Array
     """What rewards are divided by, a scalar."""
 
 
+def lesson_of(
+    parts: Sequence[tuple[Replay[Transition], int]], normalizers: Normalizers | None, reward_std: Array
+) -> Lesson:
+    """Batches of so many rows of each buffer, drawn anew each time; of those with none nothing is drawn."""
+    parts = [(data, num) for data, num in parts if num > 0]
+
+    def choose(key: Key) -> list[Array]:
+        keys = [key] if len(parts) == 1 else jax.random.split(key, len(parts))
+        return [replay.choose(keys[i], data, num) for i, (data, num) in enumerate(parts)]
+
+    def take(choice: list[Array]) -> Transition:
+        rows = [replay.take(data, index) for (data, _), index in zip(parts, choice, strict=True)]
+        return rows[0] if len(rows) == 1 else jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *rows)
+
+    return Lesson(choose, take, normalizers, reward_std)
+
+
 def train(
-    learner: Learner, key: Key, state: Any, lesson: Lesson, num_updates: int | Array, metrics: Metrics
+    learner: Learner,
+    key: Key,
+    state: Any,
+    lesson: Lesson,
+    num_updates: int,
+    metrics: Metrics,
+    wanted: bool | Array = True,
 ) -> tuple[Any, Metrics]:
-    """`num_updates` updates, which may be a traced number; `metrics` are returned where there are none."""
+    """`num_updates` updates, or none unless `wanted`, which may be traced; `metrics` are returned where there are none.
+
+    What is random is drawn for many updates at once: a few numbers at a time cost as much as a layer of a network.
+    """
     normalizers = lesson.normalizers
+    num_blocks = -(-num_updates // DRAWN_AHEAD)
+    size = -(-num_updates // num_blocks)
 
     def see(obs: Array) -> Array:
         return obs if normalizers is None else normalizer.normalize(normalizers.obs, obs)
 
-    def one_update(i: Array, carry: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
+    def keys_of(i: Array) -> tuple[Key, Key]:
         draw_key, update_key = jax.random.split(jax.random.fold_in(key, i))
-        batch = lesson.draw(draw_key)
-        reward = batch.reward / lesson.reward_std
-        batch = batch._replace(obs=see(batch.obs), next_obs=see(batch.next_obs), reward=reward)
-        return learner.update(update_key, carry[0], batch)
+        return draw_key, update_key
 
-    return jax.lax.fori_loop(0, num_updates, one_update, (state, metrics))
+    def block(b: Array, carry: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
+        draw_keys, update_keys = jax.vmap(keys_of)(b * size + jnp.arange(size))
+        choices = jax.vmap(lesson.choose)(draw_keys)
+        noises = update_keys if learner.noise is None else jax.vmap(learner.noise)(update_keys)
+
+        def one_update(i: Array, carry: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
+            choice, noise = jax.tree.map(lambda leaf: leaf[i], (choices, noises))
+            batch = lesson.take(choice)
+            reward = batch.reward / lesson.reward_std
+            batch = batch._replace(obs=see(batch.obs), next_obs=see(batch.next_obs), reward=reward)
+            return (learner.update_given or learner.update)(noise, carry[0], batch)
+
+        return jax.lax.fori_loop(0, jnp.minimum(size, num_updates - b * size), one_update, carry)
+
+    return jax.lax.fori_loop(0, jnp.where(wanted, num_blocks, 0), block, (state, metrics))
 
 
 def no_learner_metrics(learner: Learner, obs_size: int, action_size: int) -> Metrics:

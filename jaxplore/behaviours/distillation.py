@@ -352,8 +352,11 @@ def improve_learner(
 
     distilled, error = jax.lax.fori_loop(0, rnd_config.epochs, distil, (state.rnd, jnp.zeros(())))
 
-    def draw(draw_key: Key) -> Transition:
-        batch = replay.sample(draw_key, experience.data, learner.batch_size)
+    def choose(draw_key: Key) -> Array:
+        return replay.choose(draw_key, experience.data, learner.batch_size)
+
+    def take(index: Array) -> Transition:
+        batch = replay.take(experience.data, index)
         return batch._replace(reward=rnd.error(distilled, see(batch.next_obs)))
 
     reward_std = scale.std
@@ -361,8 +364,8 @@ def improve_learner(
         sample_key, key = jax.random.split(key)
         held = see(replay.sample(sample_key, experience.data, SCALE_SAMPLE).next_obs)
         reward_std = jnp.maximum(jnp.std(rnd.error(distilled, held)), 1e-6)
-    nothing = no_metrics(lambda: learner.update(key, state.learner, draw(key))[1])
-    lesson = Lesson(draw, experience.normalizers, reward_std)
+    nothing = no_metrics(lambda: learner.update(key, state.learner, take(choose(key)))[1])
+    lesson = Lesson(choose, take, experience.normalizers, reward_std)
     learned, metrics = train(learner, key, state.learner, lesson, parts.config.updates, nothing)
     after = RNDLearnerState(learned, distilled, scale, position)
     return after, {**metrics, "rnd_error": error, **_summary(bonus / reward_std, valid)}

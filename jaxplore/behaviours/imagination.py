@@ -1,7 +1,6 @@
 """Behaviour by imagination: a learner is trained in rollouts of the belief's models (Algorithm 1, lines 7-9)."""
 
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, get_args
 
@@ -13,8 +12,8 @@ from jaxplore import normalizer, replay, validate
 from jaxplore.behaviours.base import (
     Behaviour,
     Experience,
-    Lesson,
     label,
+    lesson_of,
     make_act,
     no_learner_metrics,
     renewed,
@@ -180,7 +179,7 @@ def improve(
     learner_state, metrics = state.learner, no_learner_metrics(learner, obs_size, action_size)
     if config.real_updates > 0:
         std = reward_std(real, config.normalize_reward)
-        lesson = Lesson(lambda draw_key: replay.sample(draw_key, real, learner.batch_size), normalizers, std)
+        lesson = lesson_of([(real, learner.batch_size)], normalizers, std)
         learner_state, metrics = train(learner, real_key, learner_state, lesson, config.real_updates, metrics)
 
     def one_rollout(i: Array, carry: tuple[Any, Replay[Transition], Metrics, Metrics]) -> tuple[Any, ...]:
@@ -190,10 +189,13 @@ def improve(
         rows = imagine(parts, (start_key, rollout_key), learner.actor(learner_state), is_random, experience)
         finite = jnp.isfinite(rows.reward) & jnp.all(jnp.isfinite(rows.next_obs), axis=-1)
         imagined = replay.add(imagined, rows, finite)
-        draw = mixed_draw(imagined, real, learner.batch_size, config.real_fraction)
-        lesson = Lesson(draw, normalizers, reward_std(imagined, config.normalize_reward))
-        num_updates = jnp.where(is_random, 0, config.updates_per_rollout)
-        learner_state, metrics = train(learner, train_key, learner_state, lesson, num_updates, metrics)
+        num_real = round(config.real_fraction * learner.batch_size)
+        parts_of_batch = [(real, num_real), (imagined, learner.batch_size - num_real)]
+        lesson = lesson_of(parts_of_batch, normalizers, reward_std(imagined, config.normalize_reward))
+        num_updates = config.updates_per_rollout
+        learner_state, metrics = train(
+            learner, train_key, learner_state, lesson, num_updates, metrics, wanted=~is_random
+        )
         rewards = jnp.where(finite, rows.reward, jnp.nan)
         seen = {
             "imagined_reward": jnp.nanmean(rewards),
@@ -233,24 +235,3 @@ def starts(key: Key, experience: Experience, num_actors: int, current_fraction: 
     past = replay.sample(key, experience.data, num_actors).obs
     current = (jnp.arange(num_actors) < num_current)[:, None]
     return jnp.where(current, experience.obs[None], past)
-
-
-def mixed_draw(
-    imagined: Replay[Transition], real: Replay[Transition], batch_size: int, real_fraction: float
-) -> Callable[[Key], Transition]:
-    """`draw(key) -> batch [B, ...]`, a share of it real."""
-    num_real = round(real_fraction * batch_size)
-
-    def draw(key: Key) -> Transition:
-        if num_real == 0:
-            return replay.sample(key, imagined, batch_size)
-        if num_real == batch_size:
-            return replay.sample(key, real, batch_size)
-        real_key, imagined_key = jax.random.split(key)
-        parts = (
-            replay.sample(real_key, real, num_real),
-            replay.sample(imagined_key, imagined, batch_size - num_real),
-        )
-        return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *parts)
-
-    return draw

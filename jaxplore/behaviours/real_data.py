@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxplore import replay, validate
+from jaxplore import validate
 from jaxplore.behaviours.base import (
     Behaviour,
     Experience,
-    Lesson,
     label,
+    lesson_of,
     make_act,
     no_learner_metrics,
     renewed,
@@ -133,11 +133,8 @@ def improve_reactive(
     init_key, train_key = jax.random.split(key)
     state = renewed(init_key, state, functools.partial(init_reactive, parts), config.restart_every)
     real = label(parts.belief, parts.score, experience)
-    lesson = Lesson(
-        lambda draw_key: replay.sample(draw_key, real, learner.batch_size),
-        experience.normalizers,
-        reward_std(real, config.normalize_reward),
-    )
+    std = reward_std(real, config.normalize_reward)
+    lesson = lesson_of([(real, learner.batch_size)], experience.normalizers, std)
     nothing = no_learner_metrics(learner, *parts.sizes)
     learner_state, metrics = train(learner, train_key, state.learner, lesson, config.updates, nothing)
     return ReactiveState(learner_state, state.age + 1), metrics
@@ -192,11 +189,8 @@ def make_model_free(
     config = config or ModelFreeConfig()
 
     def improve(key: Key, state: Any, experience: Experience) -> tuple[Any, Metrics]:
-        lesson = Lesson(
-            lambda draw_key: replay.sample(draw_key, experience.data, learner.batch_size),
-            experience.normalizers if config.normalize_obs else None,
-            jnp.ones(()),
-        )
+        normalizers = experience.normalizers if config.normalize_obs else None
+        lesson = lesson_of([(experience.data, learner.batch_size)], normalizers, jnp.ones(()))
         nothing = no_learner_metrics(learner, obs_size, action_size)
         return train(learner, key, state, lesson, config.updates_per_round, nothing)
 

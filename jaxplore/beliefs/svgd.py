@@ -339,10 +339,12 @@ def update(
     z = state.z if config.redraw == "fixed" else generator.sample_noise(noise_key, config.num_particles)
     batch_size = inputs.shape[0]
     further = further_points(spec, points_key, inputs, extra_inputs)
-    all_inputs = inputs if further is None else jnp.concatenate([inputs, further])
+    all_inputs = inputs if further is None else _stacked(inputs, further)
 
     thetas, to_eta = jax.vjp(lambda eta: generator.sample(eta, z), state.eta)
-    values, to_theta = jax.vjp(lambda thetas: jax.vmap(spec.apply, in_axes=(0, None))(thetas, all_inputs), thetas)
+    # Each network with a copy of the inputs: one product for all would come out in an order that has to be turned.
+    copies = jnp.broadcast_to(all_inputs[None], (config.num_particles, *all_inputs.shape))
+    values, to_theta = jax.vjp(lambda thetas: jax.vmap(spec.apply)(thetas, copies), thetas)
     start = batch_size if spec.stands_in else 0
     repulsion_values, repulsion_points = values[:, start:], all_inputs[start:]
 
@@ -352,18 +354,19 @@ def update(
     scores = num_data / batch_size / temperature * residuals / state.likelihood_var[None, None]
     direction = stein_direction(scores, repulsion_values, config)
 
-    value_move = jnp.zeros_like(values).at[:, :batch_size].add(direction.drive)
     repulsion = direction.repulsion
     if config.prior == "gp":
         prior_scores = _gp_scores(repulsion_points, repulsion_values, config)
         repulsion = repulsion + jnp.einsum("ij,jro->iro", direction.weights, prior_scores)
-    value_move = value_move.at[:, start:].add(repulsion)
-    scale = -temperature / (config.num_particles * num_data)
-    (theta_gradient,) = to_theta(scale * value_move)
+    if spec.stands_in:
+        value_move = _stacked(direction.drive, repulsion, axis=1)
+    else:
+        value_move = repulsion.at[:, :batch_size].add(direction.drive)
+    (theta_move,) = to_theta(value_move)
     if config.prior == "weights":
-        move = _weight_prior_move(thetas, direction.weights, config)
-        theta_gradient = jax.tree.map(lambda gradient, move: gradient + scale * move, theta_gradient, move)
-    (gradient,) = to_eta(theta_gradient)
+        theta_move = jax.tree.map(jnp.add, theta_move, _weight_prior_move(thetas, direction.weights, config))
+    (eta_move,) = to_eta(theta_move)
+    gradient = jax.tree.map(lambda move: -temperature / (config.num_particles * num_data) * move, eta_move)
     steps, opt_state = spec.optimizer.update(gradient, state.opt_state, state.eta)
     likelihood_var = state.likelihood_var
     if config.learn_likelihood_std:
@@ -381,6 +384,14 @@ def update(
         metrics["dead_features"] = dead_share(generator.features(state.eta, z))
     eta = optax.apply_updates(state.eta, steps)
     return SVGDState(eta=eta, opt_state=opt_state, likelihood_var=likelihood_var, z=z), metrics
+
+
+def _stacked(first: Array, second: Array, axis: int = 0) -> Array:
+    """Both one after the other, each written into place: what is read from a concatenation asks where at each entry."""
+    shape = list(first.shape)
+    shape[axis] += second.shape[axis]
+    whole = jax.lax.dynamic_update_slice_in_dim(jnp.zeros(shape, first.dtype), first, 0, axis)
+    return jax.lax.dynamic_update_slice_in_dim(whole, second, first.shape[axis], axis)
 
 
 def _follow_residuals(likelihood_var: Array, residuals: Array, config: SVGDConfig) -> Array:

@@ -37,6 +37,11 @@ class Learner(NamedTuple):
     """`update(key, state, batch [B, ...]) -> (state, metrics)`, one gradient step of every network."""
     batch_size: int
     """Transitions that an update expects, `B`."""
+    noise: Callable[[Key], Any] | None = None
+    """`noise(key) -> noise`: all that `update` draws at random from its key for a batch of `batch_size`, so that it
+    can be drawn for many updates at once. None: `update` has to draw it itself."""
+    update_given: Callable[[Any, Any, Transition], tuple[Any, Metrics]] | None = None
+    """`update_given(noise, state, batch [B, ...]) -> (state, metrics)`: `update` with its noise."""
     adopt: Callable[[Any, Any], Any] | None = None
     """`adopt(state, actor) -> state`: with the policy of another state's `actor` and everything else, such as critics,
     as in `state`. None: it has no policy that can be taken over."""
@@ -67,13 +72,22 @@ def checked(learner: Learner, obs_size: int, action_size: int) -> Learner:
         validate.shape("obs", obs, "...", obs_size)
         return learner.act_greedily(actor, obs)
 
-    def update(key: Key, state: Any, batch: Transition) -> tuple[Any, Metrics]:
+    def check(batch: Transition) -> None:
         validate.shape("batch.obs", batch.obs, "B", obs_size)
         num = batch.obs.shape[0]
         validate.shape("batch.action", batch.action, num, action_size)
         validate.shape("batch.next_obs", batch.next_obs, num, obs_size)
         validate.shape("batch.reward", batch.reward, num)
         validate.shape("batch.terminated", batch.terminated, num)
+
+    def update(key: Key, state: Any, batch: Transition) -> tuple[Any, Metrics]:
+        check(batch)
         return learner.update(key, state, batch)
 
-    return learner._replace(act=act, act_greedily=act_greedily, update=update)
+    def update_given(noise: Any, state: Any, batch: Transition) -> tuple[Any, Metrics]:
+        assert learner.update_given is not None
+        check(batch)
+        return learner.update_given(noise, state, batch)
+
+    given = update_given if learner.update_given else None
+    return learner._replace(act=act, act_greedily=act_greedily, update=update, update_given=given)

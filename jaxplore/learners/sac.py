@@ -23,6 +23,7 @@ from jaxplore.networks import (
     TanhGaussianPolicy,
     apply,
     sample_tanh_gaussian,
+    tanh_gaussian_of,
     tanh_mean,
 )
 from jaxplore.types import Array, Key, Metrics, Params, Transition
@@ -78,8 +79,8 @@ class SACConfig:
         checks.in_range("discount", 0.0, 1.0)
         checks.in_range("tau", 0.0, 1.0, open_low=True)
         checks.in_range("policy_penalty", 0.0)
+        checks.in_range("log_std_max", high=10.0)
         checks.in_range("log_std_min", high=self.log_std_max)
-        checks.in_range("log_std_max", self.log_std_min, 10.0)
 
 
 @struct.dataclass
@@ -119,8 +120,9 @@ def make_networks(obs_size: int, action_size: int, config: SACConfig) -> SACNetw
 
 def action_values(networks: SACNetworks, params: Params, obs: Array, action: Array) -> Array:
     """Both action values, `[2, ...]`, of `obs [..., O]` and `action [..., A]`; `params` are those of `q`."""
-    inputs = jnp.concatenate([obs, action], axis=-1)
-    return jax.vmap(lambda one: apply(networks.value, one, inputs)[..., 0])(params)
+    # Each network with a copy of the inputs: one product for both would come out in an order that has to be turned.
+    both = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[None], (2, *leaf.shape)), (obs, action))
+    return jax.vmap(lambda one, inputs: apply(networks.value, one, *inputs)[..., 0])(params, both)
 
 
 def state_value(networks: SACNetworks, params: Params, obs: Array) -> Array:
@@ -162,13 +164,20 @@ def act_greedily(networks: SACNetworks, actor: Params, obs: Array) -> Array:
     return tanh_mean(apply(networks.policy, actor, obs))
 
 
-def loss(networks: SACNetworks, params: Params, key: Key, target_v: Params, batch: Transition) -> tuple[Array, Metrics]:
+def noise(networks: SACNetworks, key: Key, num: int | None = None) -> Array:
+    """What an update on `num` transitions (the configuration's batch by default) draws, `[num, A]`; see `Learner`."""
+    return jax.random.normal(key, (num or networks.config.batch_size, networks.action_size))
+
+
+def loss(
+    networks: SACNetworks, params: Params, noise: Array, target_v: Params, batch: Transition
+) -> tuple[Array, Metrics]:
     """Sum of the losses of all networks (Haarnoja et al. 2018, equations 5, 7 and 12), whose gradients do not mix.
 
     Args:
         networks: the fixed parts.
         params: `SACState.params`.
-        key: of the policy's actions.
+        noise: of the policy's actions, standard normal, `[B, A]`.
         target_v: parameters of the slow value network.
         batch: `[B, ...]`.
 
@@ -178,7 +187,7 @@ def loss(networks: SACNetworks, params: Params, key: Key, target_v: Params, batc
     config = networks.config
     alpha = jnp.exp(jax.lax.stop_gradient(params["log_alpha"])) if config.learn_alpha else config.alpha
     gaussian = apply(networks.policy, params["policy"], batch.obs)
-    action, log_prob = sample_tanh_gaussian(key, gaussian)
+    action, log_prob = tanh_gaussian_of(noise, gaussian)
     # The networks share no parameters, so the gradient of the sum is each network's own.
     q_of_policy = jnp.min(action_values(networks, jax.lax.stop_gradient(params["q"]), batch.obs, action), axis=0)
     penalty = jnp.mean(tanh_mean(gaussian) ** 2) + jnp.mean(gaussian.log_std**2)
@@ -206,7 +215,12 @@ def loss(networks: SACNetworks, params: Params, key: Key, target_v: Params, batc
 
 def update(networks: SACNetworks, key: Key, state: SACState, batch: Transition) -> tuple[SACState, Metrics]:
     """One gradient step of every network on `batch [B, ...]`; see `Learner.update`."""
-    gradient, metrics = jax.grad(partial(loss, networks), has_aux=True)(state.params, key, state.target_v, batch)
+    return update_given(networks, noise(networks, key, batch.reward.shape[0]), state, batch)
+
+
+def update_given(networks: SACNetworks, noise: Array, state: SACState, batch: Transition) -> tuple[SACState, Metrics]:
+    """The same with its noise `[B, A]`; see `Learner.update_given`."""
+    gradient, metrics = jax.grad(partial(loss, networks), has_aux=True)(state.params, noise, state.target_v, batch)
     steps, opt_state = networks.optimizer.update(gradient, state.opt_state, state.params)
     params: Params = optax.apply_updates(state.params, steps)
     target_v = optax.incremental_update(params["v"], state.target_v, networks.config.tau)
@@ -249,6 +263,8 @@ def make_sac(obs_size: int, action_size: int, config: SACConfig | None = None) -
         act_greedily=partial(act_greedily, networks),
         update=partial(update, networks),
         batch_size=config.batch_size,
+        noise=partial(noise, networks),
+        update_given=partial(update_given, networks),
         adopt=adopt,
     )
     return checked(learner, obs_size, action_size)

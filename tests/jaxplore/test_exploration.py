@@ -10,7 +10,8 @@ import pytest
 
 from jaxplore import replay, rewards
 from jaxplore.behaviours import Experience, ImaginationConfig, make_imagination, uniform_actions
-from jaxplore.behaviours.imagination import mixed_draw, starts
+from jaxplore.behaviours.base import lesson_of
+from jaxplore.behaviours.imagination import starts
 from jaxplore.beliefs import Belief, FitConfig
 from jaxplore.beliefs.generator import GeneratorConfig
 from jaxplore.beliefs.svgd import SVGDConfig
@@ -313,8 +314,8 @@ def test_share_of_real_rows_in_a_draw(fraction, want):
     # two buffers of numbers: positive ones are real
     full = jnp.asarray(np.int32(8))
     real, imagined = (replay.Replay({"x": jnp.asarray(sign * np.arange(1.0, 9))}, 0 * full, full) for sign in (1, -1))
-    draw = mixed_draw(imagined, real, 16, fraction)
-    assert int(jnp.sum(draw(jax.random.key(0))["x"] > 0)) == want
+    lesson = lesson_of([(real, round(16 * fraction)), (imagined, 16 - round(16 * fraction))], None, jnp.ones(()))
+    assert int(jnp.sum(lesson.take(lesson.choose(jax.random.key(0)))["x"] > 0)) == want
 
 
 def test_rewards_are_divided_by_their_standard_deviation():
