@@ -17,7 +17,7 @@ from jaxplore.methods import METHODS
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("jaxplore", "envs", "experiments", "benchmarks")
 README = (ROOT / "README.md").read_text()
-PAGES = ("README.md", "experiments/results/README.md", "benchmarks/README.md")
+PAGES = ("README.md", "experiments/results/README.md", "experiments/training/README.md", "benchmarks/README.md")
 
 
 def example(word: str) -> str:

@@ -1,5 +1,12 @@
 """Seeds spread over devices."""
 
+import json
+import os
+import re
+import socket
+import subprocess
+import sys
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -65,3 +72,38 @@ def test_eight_seeds_on_eight_devices_are_those_on_one_and_wait_for_none_another
 @pytest.mark.parametrize("method", ["implicit", "max_reactive", "rnd"])
 def test_whole_methods_on_eight_devices(method):
     check(devices.result(devices.start("tests.experiments.on_many_devices", method, 8, num_devices=8)), 8)
+
+
+@pytest.mark.slow
+def test_two_processes_share_the_seeds_of_one_program(tmp_path):
+    # the example of the documentation, in two processes of a device each, and in one of two
+    page = (devices.ROOT / "experiments/training/README.md").read_text()
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "seeds.py").write_text(code)
+
+    def start(port: int, count: int) -> list[subprocess.Popen[str]]:
+        flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={2 // count}"
+        own = {"PYTHONPATH": str(devices.ROOT), "XLA_FLAGS": flags, "JAX_CPU_COLLECTIVES_IMPLEMENTATION": "gloo"}
+        command = [sys.executable, str(tmp_path / "seeds.py"), f"localhost:{port}", str(count)]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        return [subprocess.Popen([*command, str(i)], env={**os.environ, **own}, **pipes) for i in range(count)]
+
+    processes = [*start(free_port(), 2), *start(free_port(), 1)]
+    told = []
+    for process in processes:
+        stdout, stderr = process.communicate(timeout=500)
+        assert process.returncode == 0, stderr
+        told.append([line.split(maxsplit=2) for line in stdout.splitlines() if line[0].isdecimal()])
+    first, second, both = ({(int(step), int(seed)): json.loads(values) for step, seed, values in one} for one in told)
+    assert {seed for _, seed in first} == {0}
+    assert {seed for _, seed in second} == {2}
+    assert len(both) == len(first) + len(second) == 2 * 3  # after 50, 75 and 100 steps
+    for where, values in {**first, **second}.items():
+        assert len(values) == 2
+        np.testing.assert_allclose(values, both[where], rtol=1e-3)
+
+
+def free_port() -> int:
+    with socket.socket() as own:
+        own.bind(("localhost", 0))
+        return own.getsockname()[1]
