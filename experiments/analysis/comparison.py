@@ -1,14 +1,55 @@
-"""The tables of a comparison, in Markdown."""
+"""Runs side by side: pictures, and tables in Markdown."""
 
+import json
 import statistics
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 
+from experiments.analysis import figures
 from experiments.analysis.calibration import DATA, HELD_OUT, UNSEEN
-from experiments.analysis.statistics import MEASURES, Group, interval
-from experiments.analysis.tables import markdown_table, number
-from experiments.runs.scene import Cells
+from experiments.analysis.statistics import MEASURES, Group, group, interval
+from experiments.analysis.tables import duration, markdown_table, number
+from experiments.runs.errors import disk_error
+from experiments.runs.files import write_text
+from experiments.runs.scene import Cells, Scene
+
+
+def write(runs: Sequence[Path], names: Sequence[str | None], out: Path, until: int | None = None) -> str:
+    """Compare runs: pictures and `comparison.json` in `out`; gives the tables.
+
+    Raises:
+        RunError: a run cannot be read or does not go with the others, or `out` cannot be written.
+        ValueError: the configuration of a run is damaged.
+    """
+    first, groups = group(runs, until, names)
+    config, scene = first.config, first.scene
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        _draw(groups, first.scene, config.env, out)
+        found = {one.label: [outcome._asdict() for outcome in one.outcomes] for one in groups}
+        record = {"env": config.env, "preset": config.preset, "steps": config.steps, "methods": found}
+        write_text(out / "comparison.json", json.dumps(record, indent=2) + "\n")
+    except OSError as error:
+        raise disk_error("write the comparison", out, error) from error
+    tables = [coverage_table(groups, scene.coverage), belief_table(groups), calibration_table(groups)]
+    total = sum(outcome.minutes for one in groups for outcome in one.outcomes)
+    after = f"{duration(60 * total)} of wall time in all; written to {out}"
+    return "\n\n".join([*(text for text in tables if text), after])
+
+
+def _draw(groups: Sequence[Group], scene: Scene, env: str, out: Path) -> None:
+    curves = [figures.Curves(one.label, one.steps, one.coverage) for one in groups]
+    figures.plot_coverage(out / "coverage.png", curves, scene.coverage, episode_steps=scene.episode_steps, title=env)
+    known = [figures.Curves(one.label, one.steps, one.variance) for one in groups if np.isfinite(one.variance).any()]
+    if known:
+        figures.plot_intrinsic_reward(
+            out / "variance.png",
+            known,
+            unit=f"equation 1 ({scene.variance_unit})",
+            title=f"{env}: variance of the models on the transitions just met",
+        )
 
 
 def coverage_table(groups: Sequence[Group], cells_of: Cells) -> str:

@@ -5,6 +5,7 @@ import os
 import shlex
 import statistics
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from experiments.analysis.load import held, scene_of, series
 from experiments.analysis.tables import duration, number, span, text_table
 from experiments.runs.directory import RunDirectory
 from experiments.runs.metrics import Row
-from experiments.runs.scene import Cells
+from experiments.runs.scene import Cells, Scene
 
 PANELS = 4
 """Pictures of the floor, at equal parts of a run."""
@@ -55,14 +56,19 @@ def write(directory: RunDirectory) -> str:
     unit = f"intrinsic reward ({scene.reward_unit})" if scene.reward_unit else "intrinsic reward"
     curves = [figures.Curves(config.method, steps, reward)]
     figures.plot_intrinsic_reward(files["reward"], curves, unit=unit, title=title)
+    return "\n\n".join([summary(rows, scene.coverage, files), *hints(directory.path, rows, scene)])
+
+
+def hints(directory: Path, rows: Sequence[Row], scene: Scene) -> list[str]:
+    """What can be done next with a run, or with several seeds' runs: lines in one text, or nothing."""
     further = (
         ("To see it move", "render", scene.has_view),
         ("To ask what its models know", "calibrate", any("model_error" in row for row in rows)),
     )
-    hints = [
+    found = [
         f"{what}: python -m experiments.{name} {shlex.quote(str(directory))}" for what, name, fits in further if fits
     ]
-    return "\n\n".join([summary(rows, scene.coverage, files), *(["\n".join(hints)] if hints else [])])
+    return ["\n".join(found)] if found else []
 
 
 def summary(rows: Sequence[Row], cells: Cells, files: Mapping[str, str | os.PathLike[str]] | None = None) -> str:
