@@ -25,6 +25,7 @@ from experiments.progress import Progress
 from experiments.runs import modules
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
+from experiments.runs.seeds import expand
 from experiments.training import build, loop
 from experiments.training.ask import NEW_STEPS, STARTS, STEPS_EACH, ask
 from jaxplore.types import Key, Transition
@@ -136,7 +137,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     runtime.use_compilation_cache()
     try:
         modules.load(arguments.imports)
-        for run in arguments.runs:
+        for run in (run for path in arguments.runs for run in expand(path)):
             print(write(run, arguments.until) + "\n", flush=True)
     except (RunError, ValueError, EnvironmentFault) as error:
         print(f"error: {error}", file=sys.stderr)

@@ -18,6 +18,7 @@ from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError, disk_error
 from experiments.runs.files import replacing
 from experiments.runs.rows import FIELDS
+from experiments.runs.seeds import expand
 from experiments.runs.status import Status
 
 RUN = "run"
@@ -31,6 +32,7 @@ def to_csv(runs: Sequence[Path]) -> str:
         RunError: there is no run, or its rows cannot be read.
     """
     rows: list[dict[str, Any]] = []
+    runs = [run for path in runs for run in expand(path)]
     for run in runs:
         directory = RunDirectory(run)
         if directory.status() is Status.ABSENT:

@@ -1,11 +1,13 @@
 """How the command lines behave as processes: interrupted, terminated, or with nobody left who reads what they print."""
 
+import _thread
 import argparse
 import contextlib
 import os
 import signal
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable
 from types import FrameType, TracebackType
@@ -15,6 +17,13 @@ from experiments.runs.errors import RunError
 
 INTERRUPTED, TERMINATED = 130, 143
 """Exit statuses after Ctrl-C and after SIGTERM, as shells have them."""
+
+
+HELD = "JAXPLORE_HELD"
+"""In the environment of a process whose standard input is a pipe that another one holds open. It stops when that
+closes, as it does when the other one ends, however that ends."""
+PATIENCE = 60.0
+"""Seconds in which a process that is held stops by itself, or is stopped where it stands."""
 
 
 class Terminated(KeyboardInterrupt):
@@ -50,20 +59,36 @@ def be_brief() -> None:
 def carry_out(main: Callable[[], int]) -> None:
     """Call a command's `main` as this process's only purpose, and exit with its status.
 
-    SIGTERM stops it as Ctrl-C does. What it prints when its reader has gone, such as `head` or a terminal that was
-    closed, goes nowhere; it does not end for that.
+    SIGTERM stops it as Ctrl-C does; Ctrl-C itself is left to the process that holds it, if one does (`HELD`). What it
+    prints when its reader has gone, such as `head` or a terminal that was closed, goes nowhere; it does not end for
+    that.
     """
     sys.stdout, sys.stderr = _Patient(sys.stdout), _Patient(sys.stderr)
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, _terminate)
         if hasattr(signal, "SIGHUP"):
             signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        if os.environ.pop(HELD, None):
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+            threading.Thread(target=_stop_when_let_go, daemon=True).start()
     try:
         status = main()
     except KeyboardInterrupt as stop:
         print("\nStopped.", file=sys.stderr)
         status = status_of(stop)
     sys.exit(status)
+
+
+def _stop_when_let_go() -> None:
+    with contextlib.suppress(OSError):
+        while os.read(0, 1024):
+            pass
+    if os.name == "nt":
+        _thread.interrupt_main(signal.SIGTERM)
+    else:
+        os.kill(os.getpid(), signal.SIGTERM)  # Which ends a sleep, too.
+    time.sleep(PATIENCE)
+    os._exit(TERMINATED)
 
 
 def _terminate(number: int, frame: FrameType | None) -> None:

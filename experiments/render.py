@@ -201,7 +201,9 @@ def parse(argv: Sequence[str] | None) -> argparse.Namespace:
 
 def render(arguments: argparse.Namespace) -> str:
     """What a command line asks for: checks, then acts, then draws; gives the closing line."""
-    run: Path | None = arguments.run
+    from experiments.runs.seeds import one
+
+    run: Path | None = arguments.run and one(arguments.run).path
     config = random_config(arguments.env) if run is None else config_of(run)
     own_env, env = load_env(config, arguments.camera)
     assert env.view is not None

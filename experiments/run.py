@@ -1,6 +1,7 @@
 """The command line: `python -m experiments.run --env=ant_maze`."""
 
 import dataclasses
+import functools
 import shlex
 import sys
 from collections.abc import Sequence
@@ -15,17 +16,26 @@ from experiments.runs.command import PROGRAM, CommandLine, check_read, parse
 from experiments.runs.config import RunConfig, flag, path_of
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
+from experiments.runs.seeds import SeedRuns
 from experiments.runs.spec import RunSpec
 from experiments.runs.status import Status
+from experiments.studies import seeds
 from experiments.training import build, loop, memory, parent
 from experiments.training.programs import Programs, make_programs
 from jaxplore.exploration import Explorer
 from jaxplore.validate import FieldError
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; the exit status is 0, 1 (the run failed), 2 (bad input), 130 (interrupted) or 143
-    (terminated).
+def main(argv: Sequence[str] | None = None, *, is_command: bool = False) -> int:
+    """Run the command line.
+
+    Args:
+        argv: its words; None: those of this process.
+        is_command: whether this process is the command, and no program that has registered something of its own. Seeds
+            may then be spread over processes unasked.
+
+    Returns:
+        The exit status: 0, 1 (the run failed), 2 (bad input), 130 (interrupted) or 143 (terminated).
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     debug, directory = "--debug" in argv, None
@@ -35,16 +45,25 @@ def main(argv: Sequence[str] | None = None) -> int:
             if command.version:
                 print("\n".join(f"{name} {version}" for name, version in runtime.versions().items()))
                 return 0
+            if command.processes > 1:
+                runtime.share_device()
             env, agent, spec = prepare(spec, resume=command.resume)
             check_read(argv, spec.config, build.sizes_of(env))
+            split = seeds.are_split(command, spec, env, is_command=is_command)
             chosen = place.choose(command.out, spec, resume=command.resume)
-            programs = make_programs_that_fit(spec.config, env, agent, resume=command.resume)
+            ready = (
+                seeds.plan(command, spec, env, agent)
+                if split
+                else make_programs_that_fit(spec.config, env, agent, resume=command.resume)
+            )
         except (ValueError, RunError) as error:
             print(f"error: {error}", file=sys.stderr)
             process.show_cause(error, debug=debug)
             return 2
         with place.owned(command.out, spec, chosen, resume=command.resume) as directory:
-            return carry_out(spec, directory, env, agent, programs, command)
+            if isinstance(ready, seeds.Plan):
+                return seeds.carry_out(ready, SeedRuns(directory.path), env, command)
+            return carry_out(spec, directory, env, agent, ready, command)
     except RunError as error:
         print(f"\nerror: {error}", file=sys.stderr)
         process.show_cause(error, debug=debug)
@@ -59,7 +78,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def prepare(spec: RunSpec, *, resume: bool) -> tuple[Environment, Explorer, RunSpec]:
     """Environment and agent, which refuse what they cannot do when they are built: before anything is written.
 
-    A run that is resumed has its parent's policy in its checkpoints.
+    A run that is resumed has its parent's policy in its checkpoints. What each seed takes of several seeds' runs is
+    found out by `seeds.plan`.
 
     Returns:
         Them, and the specification with the physics engine that was chosen, so that another machine takes the same.
@@ -71,7 +91,7 @@ def prepare(spec: RunSpec, *, resume: bool) -> tuple[Environment, Explorer, RunS
         env = build.make_env(spec.config)
         spec = dataclasses.replace(spec, config=dataclasses.replace(spec.config, backend=env.backend))
         agent = build.make_agent(spec.config, env)
-        if spec.parent is not None and not resume:
+        if spec.parent is not None and not resume and not SeedRuns(spec.parent.directory).exists():
             spec = dataclasses.replace(spec, parent=parent.resolve(spec.parent, env, agent))
         return env, agent, spec
     except FieldError as error:
@@ -114,9 +134,9 @@ def carry_out(
         print(f"The run in {directory} is finished: drawing it again.", flush=True)
     else:
         last = config.seed + config.num_seeds - 1
-        seeds = f"seed {config.seed}" if config.num_seeds == 1 else f"seeds {config.seed} to {last}"
+        which = f"seed {config.seed}" if config.num_seeds == 1 else f"seeds {config.seed} to {last}"
         print(
-            f"{config.method} on {config.env}: {config.preset} preset, {seeds}, {config.steps:,} steps\n"
+            f"{config.method} on {config.env}: {config.preset} preset, {which}, {config.steps:,} steps\n"
             f"physics: {env.backend}, learning: {jax.devices()[0].device_kind}\n"
             f"writing to {directory}",
             flush=True,
@@ -127,4 +147,4 @@ def carry_out(
 
 
 if __name__ == "__main__":
-    process.carry_out(main)
+    process.carry_out(functools.partial(main, is_command=True))

@@ -30,6 +30,13 @@ def set_cpu_switches() -> None:
     jax.config.update("jax_cpu_enable_async_dispatch", False)
 
 
+def share_device() -> None:
+    """Have JAX take memory of a GPU as it needs it, not most of it at once, unless the environment says otherwise: for
+    processes that share one. Read when JAX first looks for devices, and inherited by the processes that are started.
+    """
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+
+
 def use_compilation_cache() -> None:
     """Keep compiled programs in the user's own cache directory, unless JAX already has another."""
     if jax.config.values["jax_compilation_cache_dir"] is not None:

@@ -13,6 +13,7 @@ from experiments.runs.config import RunConfig, flag, replace
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
 from experiments.runs.presets import preset_config
+from experiments.runs.seeds import SeedRuns
 from experiments.runs.spec import RunRef, RunSpec, from_json
 from experiments.runs.upgrades import MOVED
 from jaxplore.config import Sizes
@@ -40,6 +41,10 @@ class CommandLine:
     observation statistics come with it; critics are new and there are no data. For methods on the task's reward."""
     wandb: str | None = None
     """Also log to this project of Weights & Biases; WANDB_MODE=offline keeps it on this machine."""
+    processes: int = 0
+    """How many seeds run at a time, each in a process and a directory of its own below --out. 0: as many as cores and
+    memory allow where the environment runs on the host and learning on the CPU; elsewhere 1. 1: all seeds side by side
+    in one program and one directory."""
     debug: bool = False
     """Show the traceback below the message of an error."""
     version: bool = False
@@ -91,6 +96,11 @@ def parse(argv: Sequence[str]) -> tuple[CommandLine, RunSpec]:
     command, changes = flags.parse(
         words, (CommandLine(), start.config), prog=PROGRAM, description=description, layout=layout
     )
+    if command["processes"] < 0:
+        raise ValueError(
+            f"--processes={command['processes']} is out of range. Allowed: a whole number, 1 or more, or 0 for as many "
+            "as cores and memory allow."
+        )
     paths = {name: command[name] or None for name in ("out", "config", "parent", "wandb")}
     try:
         ref = RunRef.parse(paths["parent"]) if paths["parent"] else start.parent
@@ -107,8 +117,11 @@ def _start(argv: Sequence[str]) -> RunSpec:
     given = {name: flags.option(argv, name) for name in ("out", "config", "preset", "env", "method")}
     known = given["method"] if given["method"] in METHODS else None
     saved = Path(str(given["out"])) / "config.json"
-    if given["out"] and given["config"] is None and "--resume" in argv and os.path.exists(saved):
+    resumes = given["out"] and given["config"] is None and "--resume" in argv
+    if resumes and os.path.exists(saved):
         spec, source, settled = RunDirectory(str(given["out"])).spec(), str(saved), ("preset",)
+    elif resumes and SeedRuns(str(given["out"])).exists():
+        spec, source, settled = SeedRuns(str(given["out"])).spec(), str(given["out"]), ("preset",)
     elif given["config"] is not None:
         spec, source, settled = _read(Path(given["config"]), known), given["config"], ("preset", "method")
     else:

@@ -58,7 +58,7 @@ class Progress:
         self._recent.append((time.monotonic(), step))
         seconds, steps = (new - old for new, old in zip(self._recent[-1], self._recent[0], strict=True))
         rate = steps / seconds if seconds > 0 else 0.0
-        text = _seen(rows, self._num_cells)
+        text = seen(rows, self._num_cells)
         if rate > 0:
             text += f"{rate:.{0 if rate >= 9.95 else 1}f} steps/s"
         if rate > 0 and self._learning and step < self._total:
@@ -98,7 +98,7 @@ SHOWN = (
 """Fields that are shown, where rows have them."""
 
 
-def _seen(rows: Sequence[Row], num_cells: int | None) -> str:
+def seen(rows: Sequence[Row], num_cells: int | None) -> str:
     """A round in a few words; of several seeds the median, for the cells the range."""
     text = ""
     if num_cells and (cells := _values(rows, "cells")):

@@ -38,6 +38,21 @@ def read_metrics(path: str | os.PathLike[str]) -> list[dict[str, Any]]:
     return [_parse(line, path, number) for number, line in enumerate(lines, 1)]
 
 
+TAIL = 2**16
+"""Bytes at the end of a file of rows that hold at least one; a row has some hundred fields at most."""
+
+
+def last_row(path: str | os.PathLike[str]) -> dict[str, Any] | None:
+    """The last whole row of a `metrics.jsonl` that another process writes; None: there is none that can be read."""
+    try:
+        with open(path, "rb") as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - TAIL))
+            lines = file.read().split(b"\n")
+        return _parse(lines[-2], path, 0) if len(lines) > 1 else None
+    except (OSError, RunError):
+        return None
+
+
 def _parse(line: bytes, path: str | os.PathLike[str], number: int) -> dict[str, Any]:
     try:
         row = parse_json(line.decode())

@@ -11,6 +11,7 @@ from experiments.runs.config import differences
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
 from experiments.runs.schedule import on_schedule
+from experiments.runs.seeds import SeedRuns
 from experiments.runs.spec import RunSpec
 from experiments.runs.status import Status
 
@@ -19,7 +20,7 @@ RUNS = Path("runs")
 
 
 def choose(out: str | None, spec: RunSpec, *, resume: bool) -> RunDirectory:
-    """The run's directory, checked against what lies there; nothing is written.
+    """The directory of a run, or of several seeds, checked against what lies there; nothing is written.
 
     Args:
         out: where the run is to go; None: to a new directory below `RUNS`.
@@ -34,15 +35,18 @@ def choose(out: str | None, spec: RunSpec, *, resume: bool) -> RunDirectory:
         if resume:
             raise ValueError("--resume needs --out: the directory of the run to continue.")
         return _unused(spec)
-    directory = RunDirectory(out)
+    directory, all_seeds = RunDirectory(out), SeedRuns(out)
     there, status = directory.entries(), directory.status()
     if not resume:
         if there:
-            what = "another run" if status is not Status.ABSENT else "other files"
+            what = "another run" if status is not Status.ABSENT or all_seeds.exists() else "other files"
             raise RunError(f"--out={out} holds {what}. Give another directory, or --resume to continue the run.")
         return directory
     if there is None:
         raise RunError(f"--out={out} is not there, so it cannot be resumed. Leave --resume out to start a run.")
+    if all_seeds.exists():
+        _check_more(all_seeds, spec)
+        return directory
     if status is Status.ABSENT:
         if not directory.holds_only_scraps():
             raise RunError(f"--out={out} holds no run (no config.json). Give the directory of a run.")
@@ -54,9 +58,30 @@ def choose(out: str | None, spec: RunSpec, *, resume: bool) -> RunDirectory:
 def _unused(spec: RunSpec) -> RunDirectory:
     config = spec.config
     env = re.sub(r"[^\w.-]", "-", config.env)
-    base = RUNS / f"{env}-{config.method}-{config.preset}-seed{config.seed}"
+    last = config.seed + config.num_seeds - 1
+    seeds = f"seed{last}" if config.num_seeds == 1 else f"seeds{config.seed}-{last}"
+    base = RUNS / f"{env}-{config.method}-{config.preset}-{seeds}"
     names = [base, *(base.with_name(f"{base.name}-{n}") for n in range(2, 10_000))]
     return RunDirectory(next(path for path in names if not path.exists()))
+
+
+def _check_more(all_seeds: SeedRuns, spec: RunSpec) -> None:
+    """Seeds that have a run each may become more, and their runs longer; each run is checked by its own process."""
+    was, config = all_seeds.spec(), spec.config
+    more = {"steps": max(was.config.steps, config.steps), "num_seeds": max(was.config.num_seeds, config.num_seeds)}
+    changed = differences(was.config, config) if dataclasses.replace(was.config, **more) != config else []
+    _refuse(all_seeds.path, was, spec, changed, "more steps or seeds")
+
+
+def _refuse(path: Path, was: RunSpec, spec: RunSpec, changed: list[str], more: str) -> None:
+    """Refuse to resume what differs from what was saved."""
+    if was.parent != spec.parent:
+        changed.append(f"parent: {was.parent} -> {spec.parent}")
+    if changed:
+        raise ValueError(
+            f"--resume: the configuration disagrees with the one saved in {path} in {'; '.join(changed)}. "
+            f"Resume with the saved values (or {more}), or start a run in another --out."
+        )
 
 
 def _check_resume(directory: RunDirectory, status: Status, spec: RunSpec) -> None:
@@ -71,14 +96,7 @@ def _check_resume(directory: RunDirectory, status: Status, spec: RunSpec) -> Non
             f"--out={directory} is what was kept of a run, without checkpoints: it can be compared, not resumed."
         )
     changed = [] if longer else differences(directory.config(), spec.config)
-    was = directory.spec().parent
-    if was != spec.parent:
-        changed.append(f"parent: {was} -> {spec.parent}")
-    if changed:
-        raise ValueError(
-            f"--resume: the configuration disagrees with the one saved in {directory} in {'; '.join(changed)}. "
-            "Resume with the saved values (or more steps), or start a run in another --out."
-        )
+    _refuse(directory.path, directory.spec(), spec, changed, "more steps")
     steps = directory.checkpoints().steps()
     if longer and steps and on_schedule(spec.config, steps) is None:
         length = spec.config.explorer.steps_per_round

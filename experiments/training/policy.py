@@ -11,8 +11,8 @@ import numpy as np
 from gymnasium import spaces
 
 from envs.base import Environment
-from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
+from experiments.runs.seeds import one as find_run
 from experiments.runs.status import Status
 from experiments.training import build, loop
 from jaxplore import validate
@@ -132,7 +132,7 @@ def _decode(space: spaces.Space, actions: np.ndarray) -> Any:
 
 def load(run: str | os.PathLike[str], *, step: int | None = None, seed: int | None = None) -> Policy:
     """See `jaxplore.load_policy`."""
-    directory = RunDirectory(run)
+    directory = find_run(run, seed)
     if directory.status() is Status.ABSENT:
         raise RunError(f"{directory} holds no run (no config.json). Give the --out of a run.")
     config = directory.config()
