@@ -56,7 +56,9 @@ def svgd_step(config: ExplorationConfig, rate: float, inner: int) -> Result:
         return jax.lax.fori_loop(0, inner, step, state)
 
     timing = measure_chain(jax.jit(steps, donate_argnums=0), belief.init(jax.random.key(0)), inner=inner)
-    shape = f"{config.svgd.num_particles} x {widths(config.dynamics.hidden)}, batch {config.fit.batch_size}"
+    batch, rows = config.fit.batch_size, svgd_rows(config)
+    points = f"batch {batch}" if rows == batch else f"batch {batch} and {rows - batch} points"
+    shape = f"{config.svgd.num_particles} x {widths(config.dynamics.hidden)}, {points}"
     return make_result("SVGD step", shape, timing, svgd_flops(config), rate)
 
 
@@ -138,8 +140,15 @@ def random_data(capacity: int, size: int) -> Replay[Transition]:
 def svgd_flops(config: ExplorationConfig) -> int:
     """FLOPs of `svgd_step`."""
     target, generator = (OBS + ACTION, *config.dynamics.hidden, OBS), config.generator
-    noise_and_hidden = (generator.noise_size, *generator.hidden)
-    return flops.svgd_step(target, noise_and_hidden, config.svgd.num_particles, config.fit.batch_size)
+    noise_and_hidden, count = (generator.noise_size, *generator.hidden), generator.num_generators
+    return count * flops.svgd_step(target, noise_and_hidden, config.svgd.num_particles // count, svgd_rows(config))
+
+
+def svgd_rows(config: ExplorationConfig) -> int:
+    """Rows that each network runs on in an SVGD step: the batch, and the points beside it where networks repel."""
+    batch, svgd = config.fit.batch_size, config.svgd
+    further = {"batch": 0, "perturbed": batch, "independent": batch, "uniform": svgd.num_repulsion_points}
+    return batch + further[svgd.repulsion_points]
 
 
 def imagined_flops(config: ExplorationConfig) -> int:

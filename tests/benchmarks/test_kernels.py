@@ -50,6 +50,15 @@ def test_a_kernel(traced, measure, shape, flop):
     assert result.floor_seconds == pytest.approx(flop / 1e9)
 
 
+def test_points_beside_the_batch_count(traced):
+    # 8 rows of data and as many beside them; two generators of two networks each, which repel each other within a pair
+    svgd, generator = SVGDConfig(4, repulsion_points="perturbed", accept_improper=True), TINY.generator
+    config = dataclasses.replace(TINY, svgd=svgd, generator=dataclasses.replace(generator, num_generators=2))
+    result = kernels.svgd_step(config, 1e9, 2)
+    assert result.shape == "4 x 8, batch 8 and 8 points"
+    assert result.flops == 2 * flops.svgd_step(TARGET, (4, 8), models=2, batch=16)
+
+
 def test_a_whole_round_is_so_many_of_each_kernel(traced):
     # 3 epochs of 20 data in batches of 8; 5 rollouts of 3 steps, of which 3 are followed by 7 updates, after 11
     run = dataclasses.replace(SMOKE, explorer=TINY)
