@@ -158,7 +158,7 @@ def policy_action(networks: DDPGNetworks, params: Params, obs: Array) -> Array:
 
 def action_value(networks: DDPGNetworks, params: Params, obs: Array, action: Array) -> Array:
     """The value `[...]` of `action [..., A]` at `obs [..., O]`."""
-    return apply(networks.value, params, jnp.concatenate([_clip(networks.config, obs), action], axis=-1))[..., 0]
+    return apply(networks.value, params, _clip(networks.config, obs), action)[..., 0]
 
 
 def init(networks: DDPGNetworks, key: Key) -> DDPGState:
