@@ -49,6 +49,11 @@ def init(example: Record, capacity: int) -> Replay[Record]:
     return Replay(rows=rows, position=jnp.zeros((), jnp.int32), size=jnp.zeros((), jnp.int32))
 
 
+def cleared(state: Replay[Record]) -> Replay[Record]:
+    """The buffer, empty; the rows that it held are written over one by one."""
+    return Replay(rows=state.rows, position=jnp.zeros_like(state.position), size=jnp.zeros_like(state.size))
+
+
 def add(state: Replay[Record], batch: Record, valid: Array | None = None) -> Replay[Record]:
     """Write a batch, oldest rows first to go.
 

@@ -38,6 +38,7 @@ LAPTOP = ExplorationConfig(
         bound=10.0,
         replay_capacity=25_600,
         restart_every=12,
+        keep_imagined=True,
         normalize_reward=True,
     ),
     reactive=ReactiveConfig(updates=300, restart_every=12, normalize_reward=True),

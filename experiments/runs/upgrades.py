@@ -3,6 +3,7 @@
 Format 0, until November 2026: m stood twice (`imagination.num_models` beside `svgd.num_particles`, and for static
 networks alone), and `imagination` also configured methods that imagine nothing.
 Format 1, of that month: a belief had one generator, and its features were ReLU's.
+Format 2, of that month: what a policy had imagined stayed as long as the policy lived.
 """
 
 import copy
@@ -23,6 +24,10 @@ OLD_GENERATOR = {"noise_size", "hidden", "noise", "init_std", "constant_fraction
 """Fields of a generator before format 2."""
 
 
+OLD_IMAGINATION = {"num_actors", "horizon", "num_rollouts", "replay_capacity", "restart_every", "act_greedily"}
+"""Fields of imagination that a whole one had before format 3."""
+
+
 def upgrade(data: Mapping[str, Any], start: RunConfig, found: int) -> dict[str, Any]:
     """The fields of a configuration of format `found`, as today's format has them.
 
@@ -40,9 +45,11 @@ def upgrade(data: Mapping[str, Any], start: RunConfig, found: int) -> dict[str, 
         return data
     if found < 2:
         _upgrade_generator(explorer)
+    imagination = explorer.get("imagination", {})
+    if found < 3 and isinstance(imagination, dict) and imagination.keys() >= OLD_IMAGINATION:
+        imagination.setdefault("keep_imagined", True)
     if found > 0:
         return data
-    imagination = explorer.get("imagination", {})
     if isinstance(imagination, dict):
         _upgrade_models(explorer, imagination, start)
         _upgrade_reactive(explorer, imagination, start)

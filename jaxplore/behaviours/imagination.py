@@ -57,7 +57,10 @@ class ImaginationConfig:
     replay_capacity: int = 320_000
     """Imagined transitions kept. nnaisense/max makes 320,000 in a round."""
     restart_every: int = 1
-    """Rounds that a policy and its imagined data live for. 1: new ones each round (nnaisense/max). 0: for good."""
+    """Rounds that a policy lives for. 1: a new one each round (nnaisense/max). 0: for good."""
+    keep_imagined: bool = False
+    """Whether what was imagined in earlier rounds of a policy's life stays, with the rewards that it had then. Paper:
+    no, Algorithm 1 learns from what the round's own models say."""
     normalize_reward: bool = False
     """Whether rewards are divided by their standard deviation over the imagined data. Paper: no."""
     act_greedily: bool = True
@@ -173,6 +176,7 @@ def improve(
     init_key, real_key, rollouts_key = jax.random.split(key, 3)
     normalizers = experience.normalizers
     state = renewed(init_key, state, functools.partial(init, parts), config.restart_every)
+    before = state.imagined if config.keep_imagined else replay.cleared(state.imagined)
     needs_real = config.real_updates > 0 or config.real_fraction > 0
     real = label(parts.belief, parts.score, experience) if needs_real else experience.data
     obs_size, action_size = parts.example.obs.shape[0], parts.example.action.shape[0]
@@ -207,7 +211,7 @@ def improve(
     nothing = jnp.zeros(())
     seen = {"imagined_reward": nothing, "imagined_reward_p95": nothing, "invalid_imagined": nothing}
     learner_state, imagined, metrics, seen = jax.lax.fori_loop(
-        0, config.num_rollouts, one_rollout, (learner_state, state.imagined, metrics, seen)
+        0, config.num_rollouts, one_rollout, (learner_state, before, metrics, seen)
     )
     return ImaginationState(learner_state, imagined, state.age + 1), {**metrics, **seen}
 

@@ -120,6 +120,7 @@ def fake_explorer(**settings):
 GOING_ON = {
     "fit": FitConfig(epochs=0, steps=3, restart=False),
     "restart_every": 0,
+    "keep_imagined": True,
     "num_rollouts": 2,
     "normalize_reward": True,
 }
@@ -127,6 +128,7 @@ GOING_ON = {
 
 RANDOM_AND_REAL = {
     "restart_every": 2,
+    "keep_imagined": True,
     "num_actors": 64,
     "horizon": 3,
     "num_rollouts": 3,
@@ -260,6 +262,20 @@ def test_restart_resets_the_policy_and_its_imagined_data(settings, updates, rows
         state, _ = explorer.improve(jax.random.key(number), state, OBS, 20)
         assert int(state.behaviour.learner["updates"]) == k * updates
         assert int(state.behaviour.imagined.size) == k * rows
+
+
+def test_what_was_imagined_goes_with_its_round():
+    # unless it is to stay: the policy lives on, and what it learns from was said by this round's models
+    explorer = fake_explorer(**{**GOING_ON, "keep_imagined": False})
+    state = begin(explorer)
+    for number in (1, 2, 3):
+        state, _ = explorer.improve(jax.random.key(number), state, OBS, 20)
+        assert int(state.behaviour.learner["updates"]) == 4 * number
+        rows = held(state.behaviour.imagined)
+        obs, delta = normal(state, rows)
+        want = SPREAD * (3 * number) ** 2 * np.sum(obs**2, axis=1) + 100 * delta[:, 0]
+        assert len(rows.reward) == 16
+        np.testing.assert_allclose(rows.reward, want, rtol=1e-3, atol=1e-2)
 
 
 def test_first_rollouts_take_uniform_actions():

@@ -145,8 +145,8 @@ def test_a_changed_configuration_is_noticed_in_a_run_and_welcome_in_a_file(tmp_p
 def test_a_newer_format_is_refused(tmp_path: Path):
     directory = begun(tmp_path)
     path = tmp_path / "config.json"
-    path.write_text(path.read_text().replace('"format": 2', '"format": 3'))
-    with pytest.raises(RunError, match=r"has format 3; this version reads formats 0 to 2.*versions\.json"):
+    path.write_text(path.read_text().replace('"format": 3', '"format": 4'))
+    with pytest.raises(RunError, match=r"has format 4; this version reads formats 0 to 3.*versions\.json"):
         directory.status() and directory.config()
 
 
@@ -171,6 +171,7 @@ def test_every_kept_run_reads(path: Path):
         assert json.loads(json.dumps(dataclasses.asdict(getattr(explorer, name)))).items() >= was[name].items()
     # what there was no setting for was so
     assert (explorer.generator.activation, explorer.generator.num_generators) == ("relu", 1)
+    assert explorer.imagination.keep_imagined
     assert directory.status() is Status.FINISHED and directory.is_kept()
     assert max(row["step"] for row in directory.rows()) == config.steps
     found = directory.scene()

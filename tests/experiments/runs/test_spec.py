@@ -59,6 +59,7 @@ PAPER = {
     "explorer.imagination.bound": 0.0,
     "explorer.imagination.replay_capacity": 320_000,
     "explorer.imagination.restart_every": 1,
+    "explorer.imagination.keep_imagined": False,
     "explorer.imagination.normalize_reward": False,
     "explorer.imagination.act_greedily": True,
     "explorer.sac.hidden": (256, 256),
@@ -216,7 +217,7 @@ def test_a_saved_configuration_names_every_field():
 
     saved = json.loads(to_json(RunConfig()))
     assert (
-        {saved.pop("format"), saved.pop("parent")} == {2, None}
+        {saved.pop("format"), saved.pop("parent")} == {3, None}
         and saved.pop("imports") == []
         and len(saved.pop("identity")) == 16
     )
