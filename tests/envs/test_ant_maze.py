@@ -403,6 +403,11 @@ class TestParity:
         assert_close(differences, first=(5e-6, 5e-5), last=(5e-4, 5e-4))
 
 
+@pytest.mark.gpu
+class TestParityOnTheGPU(TestParity):
+    """The same where JAX's own device is a GPU, whose matrix products need not have float32's digits."""
+
+
 def assert_close(differences, first, last):
     """Bounds `(qpos, velocities)` on what `compare` gives, for one step and for all of them."""
     qpos, velocities = differences[:2]

@@ -1,5 +1,7 @@
 """The two engines on a bead whose motion has a closed form."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -141,6 +143,15 @@ def test_device_states_can_be_sharded(make_bead):
     (_, here), (_, there) = step(states, actions), step(*jax.device_put((states, actions), sharding))
     assert there.next_obs.sharding.device_set == set(devices)
     np.testing.assert_allclose(here.next_obs, there.next_obs, atol=1e-7)
+
+
+def test_products_on_the_device_have_all_digits_of_float32(make_bead):
+    # a GPU's own choice is 10 bits of mantissa; on a CPU only the program shows what was asked for
+    env = make_bead("mjx")
+    text = str(jax.make_jaxpr(env.step)(start(env), jnp.zeros(1)))
+    found = re.findall(r"dot_general\[.*?precision=(.*?)\n", text, re.DOTALL)
+    assert found
+    assert set(found) == {"(Precision.HIGHEST, Precision.HIGHEST)"}
 
 
 def test_auto_takes_the_host_where_jax_runs_on_a_cpu(make_bead, monkeypatch):
