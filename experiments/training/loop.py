@@ -222,6 +222,7 @@ class Session:
         for sink in self.sinks:
             sink.append(rows)
         self.progress.update(end, rows)
+        self._say_once("dying", record.dying(rows))
         if not survivors.any():
             self._give_up(broken, (first, end))
         for row in rows:
@@ -241,9 +242,12 @@ class Session:
 
     def _announce(self, what: str) -> None:
         """Say once that something is about to be compiled."""
-        if what not in self._announced:
-            self._announced.add(what)
-            self.progress.say(f"Compiling the {what} step: up to a minute the first time, seconds from the cache later")
+        self._say_once(what, f"Compiling the {what} step: up to a minute the first time, seconds from the cache later")
+
+    def _say_once(self, about: str, text: str) -> None:
+        if text and about not in self._announced:
+            self._announced.add(about)
+            self.progress.say(text)
 
     def _give_up(self, broken: list[list[str]], span: tuple[int, int]) -> None:
         """End a run of which no seed has survived the round."""

@@ -118,3 +118,18 @@ def diverged_error(directory: RunDirectory, names: list[str], seeds: list[int], 
         "What to do: --resume would repeat this round to the bit, so start again in a new --out with a smaller "
         "learning rate, such as --fit.lr or --sac.lr, or with --imagination.bound set."
     )
+
+
+MANY_DEAD = 0.5
+"""Share of the generator's features without effect from which on the console says so."""
+
+
+def dying(rows: Sequence[Mapping[str, Any]]) -> str:
+    """What to warn of where the generator is dying, so that its networks differ by little; empty where it is not."""
+    dead = max((row.get("fit/dead_features", 0.0) for row in rows), default=0.0)
+    if dead < MANY_DEAD:
+        return ""
+    return (
+        f"warning: {dead:.0%} of the generator's features are the same for every z (fit/dead_features), so that its "
+        "networks are nearly one. Features of ReLU, which the paper has, die; those of --generator.activation=tanh cannot."
+    )

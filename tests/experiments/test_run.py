@@ -6,6 +6,7 @@ import re
 import shlex
 import subprocess
 import sys
+import types
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from experiments.runs.flags import document
 from experiments.runs.presets import preset_config
 from experiments.runs.spec import RunSpec, from_json, to_json
 from experiments.runs.status import Status
-from experiments.training import record
+from experiments.training import loop, record
 from jaxplore import beliefs, methods
 from jaxplore.methods import Method
 from tests.experiments.tiny import CELLS, ROOT, STEPS, TINY, assert_same_run, leaves, make_point, rows
@@ -602,6 +603,18 @@ def test_numbers_are_looked_at_by_name():
     assert record.broken(finite, np.array([True, False])) == [[], []]
     error = record.diverged_error(RunDirectory("run"), ["a", "c"], [6], (50, 75))
     assert re.search(r"steps 50 to 75 came out with numbers that are not finite: a, c \(seed 6\)", str(error))
+
+
+def test_a_dying_generator_is_warned_of_once():
+    rows = [{"fit/dead_features": 0.2}, {"fit/dead_features": 0.94}]
+    assert re.match(r"warning: 94% of .*--generator\.activation=tanh", record.dying(rows))
+    assert record.dying(rows[:1]) == record.dying([{}]) == record.dying([]) == ""
+    said: list[str] = []
+    session: Any = loop.Session.__new__(loop.Session)
+    session._announced, session.progress = set(), types.SimpleNamespace(say=said.append)
+    for found in (rows[:1], rows, rows):
+        session._say_once("dying", record.dying(found))
+    assert len(said) == 1
 
 
 def test_steps_that_diverged_are_dropped_counted_and_told(tell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
