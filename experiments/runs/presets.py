@@ -33,6 +33,7 @@ LAPTOP = ExplorationConfig(
         num_random_rollouts=0,
         updates_per_rollout=75,
         real_updates=0,
+        real_fraction=0.0,
         current_fraction=0.5,
         mover="per_rollout",
         bound=10.0,

@@ -21,7 +21,7 @@ from jaxplore.validate import Checks
 
 @dataclass(frozen=True)
 class FitConfig:
-    """How a belief is fitted in each round. The defaults are the paper's; `epochs`, `restart` after nnaisense/max."""
+    """How a belief is fitted in each round. The defaults are the paper's; `epochs` after nnaisense/max."""
 
     lr: float = 1e-4
     """Adam's learning rate. Paper: 1e-4."""
@@ -33,8 +33,9 @@ class FitConfig:
     """Passes over the data per round: `epochs * max(1, N // batch_size)` steps. 0: `steps` instead."""
     steps: int = 60
     """Gradient steps per round where `epochs` is 0."""
-    restart: bool = True
-    """Whether each round starts from new parameters (nnaisense/max) or continues from the last ones."""
+    restart: bool = False
+    """Whether each round starts from new parameters (nnaisense/max) or continues from the last ones (paper: Algorithm 1
+    initialises the generator once)."""
     clip_value: float = 5.0
     """Bound on each entry of a gradient (nnaisense/max: 5). 0: none."""
     clip_norm: float = 0.0

@@ -94,11 +94,12 @@ def make_fake(reward=variance_and_change, fit=None, capacity=64, batch_size=16, 
         "num_random_rollouts": 0,
         "updates_per_rollout": 2,
         "real_updates": 0,
+        "real_fraction": 0.0,
         "replay_capacity": 256,
     }
     config = ExplorationConfig(
         data_capacity=capacity,
-        fit=fit or FitConfig(epochs=0, steps=3),
+        fit=fit or FitConfig(epochs=0, steps=3, restart=True),
         imagination=ImaginationConfig(**{**settings, **imagination}),
         sac=SACConfig(batch_size=batch_size),
     )
@@ -140,7 +141,7 @@ RANDOM_AND_REAL = {
 
 TAGGED = {
     "reward": tagged,
-    "fit": FitConfig(epochs=0, steps=1),
+    "fit": FitConfig(epochs=0, steps=1, restart=True),
     "num_rollouts": 3,
     "real_updates": 1,
     "real_fraction": 0.25,
@@ -238,7 +239,7 @@ def updates_of_a_fit(fit):
 )
 def test_epochs_set_the_length_of_a_fit(num_data, epochs, want):
     # epochs * max(1, N // 20) steps, or `steps` where epochs is 0; N is the number given, so the program is one
-    fit = FitConfig(epochs=epochs, steps=7, batch_size=20)
+    fit = FitConfig(epochs=epochs, steps=7, batch_size=20, restart=True)
     assert int(fit.num_steps(jnp.asarray(num_data))) == want
     explorer, updates = updates_of_a_fit(fit)
     assert int(updates(jax.random.key(0), begin(explorer), OBS, num_data)) == want
