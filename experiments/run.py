@@ -45,7 +45,7 @@ def main(argv: Sequence[str] | None = None, *, is_command: bool = False) -> int:
             if command.version:
                 print("\n".join(f"{name} {version}" for name, version in runtime.versions().items()))
                 return 0
-            if command.processes > 1:
+            if command.processes > 1 or (command.resume and SeedRuns(command.out or "").exists()):
                 runtime.share_device()
             env, agent, spec = prepare(spec, resume=command.resume)
             check_read(argv, spec.config, build.sizes_of(env))

@@ -35,7 +35,7 @@ class RunConfig:
     """First seed. A seed that is carried beside others ends as it would alone, but for rounding (on the device products
     of several seeds round otherwise), and in `nchain`, whose flip states are those of the first seed."""
     num_seeds: int = 1
-    """Seeds carried side by side, counting up from the first."""
+    """How many seeds, counting up from the first: side by side in one program, or each in a process (`--processes`)."""
     steps: int = 10_000
     """Environment steps of each seed, the random ones at the start included."""
     backend: str = "auto"
