@@ -11,19 +11,14 @@ import jaxplore as jx
 
 
 def main() -> dict[str, Any]:
-    """By the number of generators: bytes of the whole state over those of the fullest device (`memory`), shapes of the
-    parameters and of a device's part of them (`parts`), whether the state after an update lies as before (`laid_out`),
-    and how far the first moments and the metrics are from those on one device.
+    """Bytes of the whole state over those of the fullest device (`memory`), shapes of the parameters and of a device's
+    part of them (`parts`), whether the state after an update lies as before (`laid_out`), and how far the first moments
+    and the metrics are from those on one device.
     """
-    return {str(count): compare(count) for count in (1, 2)}
-
-
-def compare(num_generators: int) -> dict[str, Any]:
-    """One belief, laid out in both ways."""
     belief = jx.make_generator_belief(
         *(4, 2),
         jx.DynamicsConfig(hidden=(64, 64)),
-        jx.GeneratorConfig(hidden=(16,), noise_size=4, num_generators=num_generators),
+        jx.GeneratorConfig(hidden=(16,), noise_size=4),
         jx.SVGDConfig(num_particles=4),
         jx.FitConfig(batch_size=16),
     )
@@ -31,14 +26,14 @@ def compare(num_generators: int) -> dict[str, Any]:
     shardings = jx.state_shardings(jax.eval_shape(belief.init, jax.random.key(0)), mesh, min_size=1024)
     data, normalizers = random_data(), jx.dynamics.init_normalizers(4, 2)
     key = jax.random.key(2)
-    split = jax.jit(belief.init, out_shardings=shardings)(jax.random.key(1))
+    whole = jax.jit(belief.init)(jax.random.key(1))
+    expected, expected_metrics = jax.jit(belief.update)(key, whole, data, normalizers)
+    split = jax.device_put(whole, shardings)
     parts = [[list(leaf.shape), list(leaf.addressable_shards[0].data.shape)] for leaf in jax.tree.leaves(split.eta)]
     memory = bytes_of(split) / max(bytes_of(split, device) for device in jax.devices())
     after, metrics = jax.jit(belief.update, donate_argnums=1, out_shardings=(shardings, None))(
         key, split, data, normalizers
     )
-    whole = jax.jit(belief.init)(jax.random.key(1))
-    expected, expected_metrics = jax.jit(belief.update)(key, whole, data, normalizers)
     # Not the parameters: Adam's first step has the size of its learning rate, however small a gradient is.
     moments, own = optax.tree.get(expected.opt_state, "mu"), optax.tree.get(after.opt_state, "mu")
     return {
