@@ -1,0 +1,43 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from envs import ant_maze
+from jaxplore import METHODS, Replay, Transition
+
+
+@pytest.fixture(scope="module")
+def oracles():
+    """Its methods leave with it."""
+    before = set(METHODS)
+    from benchmarks import oracles
+
+    yield oracles
+    for name in set(METHODS) - before:
+        del METHODS[name]
+
+
+def at(*places: tuple[float, float]) -> jnp.ndarray:
+    obs = np.zeros((len(places), len(ant_maze.SPEC.obs_names)), np.float32)
+    obs[:, list(ant_maze.POSITION)] = places
+    return jnp.asarray(obs)
+
+
+def test_along_the_corridor_cells_lie_two_metres_apart(oracles):
+    centres = [(2.0 * i, 2.0 * j) for i, j in ant_maze.FREE]
+    np.testing.assert_allclose(oracles.along(at(*centres)), 2.0 * np.arange(7))
+
+
+def test_rarity_counts_the_rows_held(oracles):
+    # three rows end in one square, one in another; the last row is not held
+    next_obs = at((0.1, 0.1), (0.2, 0.4), (0.4, 0.2), (4.0, 4.0), (0.1, 0.1))
+    num, flag = len(next_obs), jnp.zeros(5, bool)
+    rows = Transition(jnp.zeros_like(next_obs), jnp.zeros((num, 8)), jnp.zeros(num), next_obs, flag, flag)
+    reward = oracles.rarity(Replay(rows, jnp.int32(4), jnp.int32(4)))
+    np.testing.assert_allclose(reward[:4], [3**-0.5] * 3 + [1.0], rtol=1e-6)
+
+
+def test_squares_cover_the_maze(oracles):
+    corners = at((-1, -1), (4.99, 4.99), (-3, 9))
+    assert jax.device_get(oracles.square_of(corners)).tolist() == [0, 143, 11]
