@@ -50,7 +50,7 @@ def rarity(data: Replay[Transition]) -> Array:
 
 
 def along(obs: Array) -> Array:
-    """How far along the corridor an observation `[..., O]` is [m]: 0 in the middle of the first cell, 12 of the last."""
+    """How far along the corridor observations `[..., O]` are [m]: 0 in the middle of the first cell, 12 of the last."""
     x, y = (obs[..., i] for i in ant_maze.POSITION)
     first, middle, last = jnp.minimum(x, 4.0), 4.0 + y, 12.0 - x
     return jnp.where(y > 3.0, last, jnp.where((x > 3.0) & (y > 0.0), middle, first))
