@@ -63,7 +63,7 @@ def make_physics(model: mujoco.MjModel, frame_skip: int) -> Physics:
             data = mjx.step(device_model, data)
             return MjxState(**{name: getattr(data, name) for name in vars(state)})
 
-        # MJX relies on the first. The second: NVIDIA GPUs would multiply with 10 bits of mantissa, and the physics drifts.
+        # MJX relies on the first. The second: NVIDIA GPUs would multiply with 10 bits of mantissa, and physics drift.
         with jax.numpy_rank_promotion("allow"), jax.default_matmul_precision("highest"):
             return jax.lax.fori_loop(0, frame_skip, substep, state)
 

@@ -42,9 +42,9 @@ class CommandLine:
     wandb: str | None = None
     """Also log to this project of Weights & Biases; WANDB_MODE=offline keeps it on this machine."""
     processes: int = 0
-    """How many seeds run at a time, each in a process and a directory of its own below --out; 1: all side by side in one
-    program and one directory; 0: where the environment runs on the host and learning on the CPU, as many as cores and
-    memory allow, elsewhere 1."""
+    """How many seeds run at a time, each in a process and a directory of its own below --out; 1: all side by side in
+    one program and one directory; 0: where the environment runs on the host and learning on the CPU, as many as cores
+    and memory allow, elsewhere 1."""
     debug: bool = False
     """Show the traceback below the message of an error."""
     version: bool = False

@@ -33,7 +33,8 @@ from jaxplore.validate import Checks
 @dataclass(frozen=True)
 class ImaginationConfig:
     """How the policy is trained in each round. The defaults are nnaisense/max's, which the paper uses, but for what
-    Algorithm 1 prints: the policy learns from imagined and from real data, both with the round's own rewards."""
+    Algorithm 1 prints: the policy learns from imagined and from real data, both with the round's own rewards.
+    """
 
     num_actors: int = 128
     """Rollouts side by side. nnaisense/max: 128."""
@@ -48,8 +49,8 @@ class ImaginationConfig:
     real_updates: int = 100
     """Updates on the real data alone, before imagining. nnaisense/max: 100."""
     real_fraction: float = 0.5
-    """Share of each later batch that is real. Paper: the policy is trained on the union of both (Algorithm 1, lines 9 to
-    11), which does not say how much of a batch is real. 0: imagined data only (nnaisense/max); 1: real data only."""
+    """Share of each later batch that is real. Paper: the policy is trained on the union of both (Algorithm 1), which
+    does not say how much of a batch is real. 0: imagined data only (nnaisense/max); 1: real data only."""
     current_fraction: float = 1.0
     """Share of the actors that start where the environment stands; the others start in past states."""
     mover: Mover = "per_step"
