@@ -131,5 +131,5 @@ def dying(rows: Sequence[Mapping[str, Any]]) -> str:
         return ""
     return (
         f"warning: {dead:.0%} of the generator's features are the same for every z (fit/dead_features), so that its "
-        "networks are nearly one. Features of ReLU, which the paper has, die; with --generator.activation=tanh none can."
+        "networks are nearly one. ReLU's, which the paper has, die; with --generator.activation=tanh none do."
     )
