@@ -49,3 +49,18 @@ def sac_update(obs: int, action: int, hidden: tuple[int, ...], batch: int) -> in
     policy, value, q = (obs, *hidden, 2 * action), (obs, *hidden, 1), (obs + action, *hidden, 1)
     through_q = 2 * forward(q, batch)  # Forward, and backward to the action.
     return train(policy, batch) + train(value, batch) + forward(value, batch) + 2 * (train(q, batch) + through_q)
+
+
+def sac_v2_update(obs: int, action: int, hidden: tuple[int, ...], batch: int) -> int:
+    """One update of SAC's second form, as others have it: a policy and two action values with slow copies, no value.
+
+    The policy runs on both observations, and the slow copies take the value network's place.
+    """
+    policy, q = (obs, *hidden, 2 * action), (obs + action, *hidden, 1)
+    through_q = 2 * forward(q, batch)  # Forward, and backward to the action.
+    return train(policy, batch) + forward(policy, batch) + 2 * (train(q, batch) + through_q + forward(q, batch))
+
+
+def ensemble_step(target: tuple[int, ...], models: int, batch: int) -> int:
+    """One gradient step of networks that each have a batch of their own."""
+    return models * train(target, batch)

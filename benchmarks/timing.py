@@ -1,5 +1,6 @@
-"""The one timing helper of the benchmarks, and the machine's own limit measured with it."""
+"""The timing helpers of the benchmarks, and the machine's own limit measured with them."""
 
+import statistics
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -17,6 +18,20 @@ class Timing(NamedTuple):
     median: float
     compile: float
     """Of the first call, compilation included."""
+
+
+class Pairs(NamedTuple):
+    """Two ways to do the same, timed in turn."""
+
+    ours: float
+    """Median seconds of one unit of work."""
+    theirs: float
+    ratio: float
+    """Median over pairs of theirs over ours: above 1 where ours is the quicker."""
+    low: float
+    """Lower quartile of that ratio."""
+    high: float
+    """Upper quartile."""
 
 
 def measure(call: Callable[[], Any], *, repeats: int = 5, inner: int = 1) -> Timing:
@@ -48,6 +63,48 @@ def measure_chain(call: Callable[[Any], Any], state: Any, *, repeats: int = 5, i
         return state
 
     return measure(once, repeats=repeats, inner=inner)
+
+
+def measure_pairs(
+    ours: Callable[[], Any],
+    theirs: Callable[[], Any],
+    *,
+    pairs: int = 15,
+    calls: int = 1,
+    inner: int = 1,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Pairs:
+    """Time two calls in turn: ours, theirs, ours, theirs, ...
+
+    What else the machine does then slows both down, and the ratio within a pair says more than that of two medians.
+
+    Args:
+        ours: one side; what it returns is waited for, if it is JAX's.
+        theirs: the other. Both are called twice before, as a second call may compile again.
+        pairs: how many; at least 2.
+        calls: of one side in a row, as one time. More where a call is short: the first after the other side finds
+            caches that are not its own.
+        inner: how many units of work one call does; the times are per unit.
+        clock: seconds.
+
+    Raises:
+        ValueError: fewer than two pairs.
+    """
+    if pairs < 2:
+        raise ValueError(f"pairs={pairs}. Allowed: at least 2, as quartiles are of several.")
+
+    def once(call: Callable[[], Any]) -> float:
+        began = clock()
+        for _ in range(calls):
+            jax.block_until_ready(call())
+        return (clock() - began) / (calls * inner)
+
+    for call in (ours, theirs) * 2:
+        jax.block_until_ready(call())
+    times = [(once(ours), once(theirs)) for _ in range(pairs)]
+    low, ratio, high = statistics.quantiles([their / our for our, their in times], n=4, method="inclusive")
+    our_times, their_times = zip(*times, strict=True)
+    return Pairs(statistics.median(our_times), statistics.median(their_times), ratio, low, high)
 
 
 def matmul_rate() -> float:
