@@ -191,9 +191,29 @@ def test_mctx_searches_by_our_rules():
 @pytest.mark.parametrize("package", ["sbx", "stable_baselines3"])
 def test_sac_of_peers_updates(package):
     pytest.importorskip(package)
-    model = sac.filled(package, TINY.sac)
-    model.train(2, 4)
+    with jax.numpy_rank_promotion("allow"):
+        model = sac.filled(package, TINY.sac)
+        model.train(2, 4)
     assert model._n_updates == 2
+
+
+def test_flops_of_the_second_form_against_what_xla_counts_of_sbx(monkeypatch):
+    pytest.importorskip("sbx")
+    config, programs = SACConfig(hidden=(256, 256), batch_size=256), []
+    with jax.numpy_rank_promotion("allow"):
+        model = sac.filled("sbx", config)
+        update = type(model)._train
+
+        def compile_only(*given):
+            programs.append(update.lower(type(model), *given).compile())
+            return *given[6:], None
+
+        monkeypatch.setattr(model, "_train", compile_only)
+        sac.sbx_given(model)()
+    analysis = programs[0].cost_analysis()
+    counted = (analysis[0] if isinstance(analysis, list) else analysis)["flops"]
+    # XLA also counts biases, activations and Adam.
+    assert counted == pytest.approx(flops.sac_v2_update(31, 8, config.hidden, 256), rel=0.05)
 
 
 def test_the_table_of_peers():
