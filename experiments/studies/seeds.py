@@ -198,7 +198,7 @@ def _run(plan: Plan, directory: SeedRuns, todo: Sequence[int], command: CommandL
     display.begin(before, [seed for seed in logs if seed not in todo])
     if command.resume:
         _wait_for([directory.run(seed) for seed in todo], display)
-    display.say("Compiling, in each process: up to a minute the first time, seconds from the cache later")
+    display.say("Each process compiles its own programs: up to a minute the first time, seconds from the cache later")
     told: set[int] = set()
 
     def tell(running: Sequence[int], ended: Mapping[int, End]) -> None:
@@ -248,21 +248,22 @@ def _report(directory: SeedRuns, finished: Sequence[RunDirectory], took: str) ->
 
 def _close(plan: Plan, directory: SeedRuns) -> int:
     """Name the seeds that are in no table; the exit status."""
-    left, can_go_on = [], False
+    open_ones, diverged = [], []
     for seed in directory.seeds():
         run = directory.run(seed)
-        status = run.status()
-        row = last_row(run.metrics_path) or {"step": 0}
+        status, row = run.status(), last_row(run.metrics_path) or {"step": 0}
         if status is Status.DIVERGED:
-            left.append(f"seed {seed} diverged at step {row['step']:,} (not finite: {row.get('diverged')})")
+            diverged.append(f"seed {seed} diverged at step {row['step']:,} (not finite: {row.get('diverged')})")
         elif status is not Status.FINISHED:
-            left.append(f"seed {seed} stands at step {row['step']:,} ({directory.log(seed)} has what it printed)")
-            can_go_on = True
+            open_ones.append(f"seed {seed} stands at step {row['step']:,} (see {directory.log(seed)})")
+    left = [*open_ones, *diverged]
     if not left:
         return 0
-    how = "Others than those that diverged can be continued" if can_go_on else "Start runs with other settings"
     words = shlex.join([f"--out={directory}", "--resume", *(f"--import={name}" for name in plan.spec.imports)])
-    again = f" {how}: {PROGRAM} {words}" if can_go_on else f" {how} in another --out."
+    which = "those that did not diverge" if diverged else "them"
+    again = (
+        f"To continue {which}: {PROGRAM} {words}" if open_ones else "Start them with other settings in another --out."
+    )
     count = len(directory.seeds())
-    print(f"\nerror: {len(left)} of {count} seeds are not in the tables: {'; '.join(left)}.{again}", file=sys.stderr)
+    print(f"\nerror: {len(left)} of {count} seeds are not in the tables: {'; '.join(left)}. {again}", file=sys.stderr)
     return 1
