@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import sysconfig
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -87,8 +88,9 @@ def run_all(
 
 
 def _start(job: Job, variables: Mapping[str, str]) -> _Process:
-    # What this process can import they can, too, wherever it found it.
-    path = os.pathsep.join(filter(None, sys.path))
+    # What this process can import it can, too: beside Python's own folders, which it finds by itself.
+    own = tuple(sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+    path = os.pathsep.join(entry for entry in sys.path if entry and not entry.startswith(own))
     environment = {**os.environ, "PYTHONPATH": path, **variables, process.HELD: "1"}
     with job.log.open("ab") as log:
         before = log.tell()

@@ -82,6 +82,18 @@ def test_so_many_at_a_time_and_how_each_ended(tmp_path: Path):
     assert (tmp_path / "4.log").read_text() == "so\n"
 
 
+def test_it_imports_what_this_process_can(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (tmp_path / "mine.py").write_text("print('mine')")
+    monkeypatch.syspath_prepend(tmp_path)
+    script = "import os, mine, experiments; print(os.environ['PYTHONPATH'])"
+    ended = run_all(jobs(tmp_path, script), 1, lambda *_: None)
+    assert ended[0] == End(0, None)
+    said, path = (tmp_path / "0.log").read_text().splitlines()
+    assert said == "mine"
+    # which another Python that it starts could not bear
+    assert "site-packages" not in path and os.path.dirname(os.__file__) not in path.split(os.pathsep)
+
+
 def test_a_log_of_before_is_kept_and_not_read(tmp_path: Path):
     (tmp_path / "0.log").write_text("error: of before\n")
     ended = run_all(jobs(tmp_path, "raise SystemExit(1)"), 1, lambda *_: None)
