@@ -37,13 +37,18 @@ def table(lines: Sequence[Line]) -> str:
     rows = [
         (
             *(line.kernel, line.shape, line.who, as_time(line.pairs.ours), as_time(line.pairs.theirs)),
-            number(line.pairs.ratio),
-            f"{number(line.pairs.low)} to {number(line.pairs.high)}",
+            as_ratio(line.pairs.ratio),
+            f"{as_ratio(line.pairs.low)} to {as_ratio(line.pairs.high)}",
             *(_as_flops(line.our_flops), _as_flops(line.their_flops)),
         )
         for line in lines
     ]
     return text_table(HEAD, rows)
+
+
+def as_ratio(ratio: float) -> str:
+    """A ratio with two decimals, or as a whole number from 10 on: 0.96 and 1.04 are not the same."""
+    return f"{ratio:.2f}" if ratio < 10 else f"{ratio:,.0f}"
 
 
 def _as_flops(flops: int | None) -> str:
