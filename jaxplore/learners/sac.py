@@ -40,6 +40,9 @@ class SACConfig:
     """nnaisense/max: leaky ReLU, slope 0.01."""
     init: str = "orthogonal"
     """Initialiser of every layer. nnaisense/max: orthogonal, gain 1."""
+    layer_norm: bool = False
+    """Whether hidden layers of the value networks are normalised (Ba et al. 2016): with many updates for each real step
+    values of actions never taken are otherwise overestimated (Ball et al. 2023, arXiv 2302.02948). Paper: no."""
     lr: float = 1e-3
     """Adam's learning rate for all networks. Paper: 1e-3."""
     batch_size: int = 4096
@@ -113,7 +116,7 @@ def make_networks(obs_size: int, action_size: int, config: SACConfig) -> SACNetw
     """The networks and the optimiser that `config` describes."""
     log_std_bounds = (config.log_std_min, config.log_std_max)
     policy = TanhGaussianPolicy(config.hidden, action_size, config.activation, config.init, log_std_bounds)
-    value = MLP(config.hidden, 1, config.activation, config.init, config.init)
+    value = MLP(config.hidden, 1, config.activation, config.init, config.init, config.layer_norm)
     optimizer = optax.chain(optax.clip(config.grad_clip), optax.adam(config.lr))
     return SACNetworks(policy, value, optimizer, config, obs_size, action_size)
 

@@ -65,6 +65,7 @@ PAPER = {
     "explorer.sac.hidden": (256, 256),
     "explorer.sac.activation": "leaky_relu",
     "explorer.sac.init": "orthogonal",
+    "explorer.sac.layer_norm": False,
     "explorer.sac.lr": 1e-3,
     "explorer.sac.batch_size": 4096,
     "explorer.sac.alpha": 0.02,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import integrate, optimize, stats
 
-from jaxplore.learners.sac import SACConfig, make_sac
+from jaxplore.learners.sac import SACConfig, action_values, make_networks, make_sac
 from jaxplore.networks import GaussianParams, sample_tanh_gaussian
 from jaxplore.types import Transition
 from tests.jaxplore import probes
@@ -160,6 +160,17 @@ def test_init_starts_the_slow_network_at_the_value_network():
     assert not np.allclose(kernel[0], kernel[1])
     for member in kernel:
         np.testing.assert_allclose(member.T @ member, np.eye(8), atol=1e-5)
+
+
+def test_value_networks_alone_are_normalised_where_asked():
+    # a value is then bounded by its last layer, however far away the action is; the policy stays as it is
+    sac = make_sac(3, 2, SACConfig(hidden=(16, 16), batch_size=4, layer_norm=True))
+    state = sac.init(jax.random.key(0))
+    assert [name for name in state.params["q"] if "norm" in name] == ["norm_0", "norm_1"]
+    assert "norm_0" in state.params["v"] and "norm_0" not in state.params["policy"]["mlp"]
+    networks = make_networks(3, 2, SACConfig(hidden=(16, 16), layer_norm=True))
+    near, far = (action_values(networks, state.params["q"], jnp.zeros((1, 3)), jnp.full((1, 2), x)) for x in (1e2, 1e6))
+    np.testing.assert_allclose(near, far, rtol=1e-2)
 
 
 def test_actions_are_the_policys():
