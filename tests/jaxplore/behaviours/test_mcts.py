@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
-from jaxplore.behaviours.mcts import MCTSConfig, Tables, make_mcts
+from jaxplore.behaviours.mcts import MCTSConfig, Tables, make_mcts, small_integers
 
 ROOT = jnp.int32(0)
 
@@ -154,6 +155,21 @@ def test_equal_actions_are_tied_at_random():
     plan = make_mcts(2, MCTSConfig(num_iterations=4, horizon=3)).plan
     actions, _ = jax.vmap(plan, in_axes=(0, None, None))(jax.random.split(jax.random.key(1), 200), tables, jnp.int32(3))
     assert abs(float(jnp.mean(actions)) - 0.5) < 5 * 0.5 / math.sqrt(200)
+
+
+@pytest.mark.parametrize("limit", [1, 2, 10, 192])
+def test_integers_cut_out_of_words_are_uniform_and_independent(limit):
+    # chi-squared of the values, and of numbers that may come of one word: these lie a quarter apart, or a half, ...
+    shape = (6, 10, 130)
+    drawn = np.asarray(small_integers(jax.random.key(0), shape, limit))
+    assert drawn.shape == shape and drawn.dtype == np.int32 and 0 <= drawn.min() <= drawn.max() < limit
+    values = drawn.ravel()
+    if limit > 1:
+        assert stats.chisquare(np.bincount(values, minlength=limit)).pvalue > 1e-3
+        high = values >= limit / 2
+        for apart in (1, *(len(high) // parts for parts in range(2, 19))):
+            table = np.histogram2d(high[:-apart], high[apart:], 2)[0]
+            assert stats.chi2_contingency(table).pvalue > 1e-4
 
 
 def test_a_random_model_moves_each_edge_and_each_step():
