@@ -26,7 +26,7 @@ from jaxplore import (
     rewards,
     rollout,
 )
-from jaxplore.behaviours.base import lesson_of, no_learner_metrics, train
+from jaxplore.behaviours.base import AS_THEY_ARE, lesson_of, no_learner_metrics, train
 from jaxplore.beliefs import Belief
 
 OBS, ACTION = 31, 8
@@ -89,7 +89,7 @@ def imagined_step(config: ExplorationConfig, rate: float) -> Result:
 def sac_update(config: ExplorationConfig, rate: float, inner: int) -> Result:
     """One SAC update on a batch drawn from a replay, as a round makes many of them."""
     sac = make_sac(OBS, ACTION, config.sac)
-    lesson = lesson_of([(random_data(8192, 8192), config.sac.batch_size)], None, jnp.ones(()))
+    lesson = lesson_of([(random_data(8192, 8192), config.sac.batch_size)], None, AS_THEY_ARE)
     nothing = no_learner_metrics(sac, OBS, ACTION)
 
     def updates(state: Any) -> Any:

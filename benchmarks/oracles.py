@@ -18,7 +18,7 @@ import jax.numpy as jnp
 
 from envs import ant_maze
 from jaxplore import METHODS, Behaviour, ExplorationConfig, Method, Sizes, Transition
-from jaxplore.behaviours.base import Experience, lesson_of, make_act, no_learner_metrics, renewed, reward_std, train
+from jaxplore.behaviours.base import Experience, lesson_of, make_act, no_learner_metrics, renewed, reward_moments, train
 from jaxplore.behaviours.real_data import ReactiveState
 from jaxplore.learners import Learner
 from jaxplore.parts import make_learner, no_belief, no_reward, reads
@@ -75,8 +75,8 @@ def on_real_data(sizes: Sizes, config: ExplorationConfig, belief: object, score:
         state = renewed(init_key, state, init, reactive.restart_every)
         rows = experience.data.rows._replace(reward=rule(experience.data))
         real = dataclasses.replace(experience.data, rows=rows)
-        std = reward_std(real, reactive.normalize_reward)
-        lesson = lesson_of([(real, learner.batch_size)], experience.normalizers, std)
+        moments = reward_moments(real, reactive.normalize_reward, reactive.center_reward)
+        lesson = lesson_of([(real, learner.batch_size)], experience.normalizers, moments)
         nothing = no_learner_metrics(learner, sizes.obs, sizes.action)
         learned, metrics = train(learner, train_key, state.learner, lesson, reactive.updates, nothing)
         return ReactiveState(learned, state.age + 1), metrics

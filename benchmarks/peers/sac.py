@@ -23,7 +23,7 @@ from benchmarks.result import widths
 from benchmarks.timing import measure_pairs
 from experiments.runs.presets import preset_config
 from jaxplore import SACConfig, make_sac, replay
-from jaxplore.behaviours.base import lesson_of, no_learner_metrics, train
+from jaxplore.behaviours.base import AS_THEY_ARE, lesson_of, no_learner_metrics, train
 from jaxplore.config import TASK_SAC
 
 ROWS = 8192
@@ -111,7 +111,7 @@ def ours_many(config: SACConfig, num: int) -> Callable[[], Any]:
 
     def update(key: jax.Array, state: Any, data: Any) -> Any:
         key, train_key = jax.random.split(key)
-        lesson = lesson_of([(data, config.batch_size)], None, jnp.ones(()))
+        lesson = lesson_of([(data, config.batch_size)], None, AS_THEY_ARE)
         return key, train(sac, train_key, state, lesson, num, nothing)
 
     return _chain(update, sac.init(jax.random.key(0)), random_data(ROWS, ROWS))

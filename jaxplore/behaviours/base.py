@@ -116,6 +116,13 @@ def label(belief: Belief, score: Score, experience: Experience) -> Replay[Transi
     return dataclasses.replace(data, rows=data.rows._replace(reward=rewards))
 
 
+class RewardMoments(NamedTuple):
+    """What a learner counts rewards in: `(reward - mean) / std`, scalars."""
+
+    std: Array | float
+    mean: Array | float
+
+
 class Lesson(NamedTuple):
     """What a learner is trained on."""
 
@@ -125,12 +132,12 @@ class Lesson(NamedTuple):
     """`take(choice) -> batch [B, ...]`."""
     normalizers: Normalizers | None
     """What observations are normalised with. None: they stay as they are."""
-    reward_std: Array
-    """What rewards are divided by, a scalar."""
+    moments: RewardMoments
+    """What the learner counts rewards in."""
 
 
 def lesson_of(
-    parts: Sequence[tuple[Replay[Transition], int]], normalizers: Normalizers | None, reward_std: Array
+    parts: Sequence[tuple[Replay[Transition], int]], normalizers: Normalizers | None, moments: RewardMoments
 ) -> Lesson:
     """Batches of so many rows of each buffer, drawn anew each time; of those with none nothing is drawn."""
     parts = [(data, num) for data, num in parts if num > 0]
@@ -143,7 +150,7 @@ def lesson_of(
         rows = [replay.take(data, index) for (data, _), index in zip(parts, choice, strict=True)]
         return rows[0] if len(rows) == 1 else jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *rows)
 
-    return Lesson(choose, take, normalizers, reward_std)
+    return Lesson(choose, take, normalizers, moments)
 
 
 def train(
@@ -178,7 +185,7 @@ def train(
         def one_update(i: Array, carry: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
             choice, noise = jax.tree.map(lambda leaf: leaf[i], (choices, noises))
             batch = lesson.take(choice)
-            reward = batch.reward / lesson.reward_std
+            reward = (batch.reward - lesson.moments.mean) / lesson.moments.std
             batch = batch._replace(obs=see(batch.obs), next_obs=see(batch.next_obs), reward=reward)
             return (learner.update_given or learner.update)(noise, carry[0], batch)
 
@@ -195,12 +202,17 @@ def no_learner_metrics(learner: Learner, obs_size: int, action_size: int) -> Met
     return no_metrics(lambda: learner.update(key, learner.init(key), batch)[1])
 
 
-def reward_std(data: Replay[Transition], wanted: bool) -> Array:
-    """Standard deviation of the rewards held, at least 1e-6; 1 where rewards stay as they are."""
-    if not wanted:
-        return jnp.ones(())
+AS_THEY_ARE = RewardMoments(1.0, 0.0)
+"""Rewards in their own units."""
+
+
+def reward_moments(data: Replay[Transition], normalize: bool, center: bool) -> RewardMoments:
+    """Of the rewards held the standard deviation, at least 1e-6, and the mean; 1 and 0 where they are not asked for."""
+    if not normalize and not center:
+        return AS_THEY_ARE
     held = jnp.arange(replay.capacity(data)) < data.size
     count = jnp.maximum(data.size, 1)
     rewards = jnp.where(held, data.rows.reward, 0.0)
     mean = jnp.sum(rewards) / count
-    return jnp.maximum(jnp.sqrt(jnp.sum(jnp.where(held, rewards - mean, 0.0) ** 2) / count), 1e-6)
+    std = jnp.maximum(jnp.sqrt(jnp.sum(jnp.where(held, rewards - mean, 0.0) ** 2) / count), 1e-6)
+    return RewardMoments(std if normalize else AS_THEY_ARE.std, mean if center else AS_THEY_ARE.mean)

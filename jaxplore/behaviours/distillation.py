@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxplore import normalizer, replay
-from jaxplore.behaviours.base import Behaviour, Bonus, Experience, Lesson, make_act, train
+from jaxplore.behaviours.base import Behaviour, Bonus, Experience, Lesson, RewardMoments, make_act, train
 from jaxplore.behaviours.real_data import ReactiveConfig
 from jaxplore.dynamics import Normalizers
 from jaxplore.learners.base import Learner
@@ -365,7 +365,7 @@ def improve_learner(
         held = see(replay.sample(sample_key, experience.data, SCALE_SAMPLE).next_obs)
         reward_std = jnp.maximum(jnp.std(rnd.error(distilled, held)), 1e-6)
     nothing = no_metrics(lambda: learner.update(key, state.learner, take(choose(key)))[1])
-    lesson = Lesson(choose, take, experience.normalizers, reward_std)
+    lesson = Lesson(choose, take, experience.normalizers, RewardMoments(reward_std, 0.0))
     learned, metrics = train(learner, key, state.learner, lesson, parts.config.updates, nothing)
     after = RNDLearnerState(learned, distilled, scale, position)
     return after, {**metrics, "rnd_error": error, **_summary(bonus / reward_std, valid)}

@@ -17,7 +17,7 @@ from jaxplore.behaviours.base import (
     make_act,
     no_learner_metrics,
     renewed,
-    reward_std,
+    reward_moments,
     train,
 )
 from jaxplore.behaviours.rollout import Mover, World, rollout
@@ -66,6 +66,9 @@ class ImaginationConfig:
     no, Algorithm 1 learns from what the round's own models say."""
     normalize_reward: bool = False
     """Whether rewards are divided by their standard deviation over the imagined data. Paper: no."""
+    center_reward: bool = False
+    """Whether their mean over the same data is taken off. A policy of unending episodes is the same for any constant,
+    but values first have to climb to it: with a discount of 0.99 to a hundred times the mean. Paper: no."""
     act_greedily: bool = True
     """Whether the real environment gets the policy's squashed mean (nnaisense/max) or a sample."""
 
@@ -185,8 +188,8 @@ def improve(
     obs_size, action_size = parts.example.obs.shape[0], parts.example.action.shape[0]
     learner_state, metrics = state.learner, no_learner_metrics(learner, obs_size, action_size)
     if config.real_updates > 0:
-        std = reward_std(real, config.normalize_reward)
-        lesson = lesson_of([(real, learner.batch_size)], normalizers, std)
+        moments = reward_moments(real, config.normalize_reward, config.center_reward)
+        lesson = lesson_of([(real, learner.batch_size)], normalizers, moments)
         learner_state, metrics = train(learner, real_key, learner_state, lesson, config.real_updates, metrics)
 
     def one_rollout(i: Array, carry: tuple[Any, Replay[Transition], Metrics, Metrics]) -> tuple[Any, ...]:
@@ -198,7 +201,8 @@ def improve(
         imagined = replay.add(imagined, rows, finite)
         num_real = round(config.real_fraction * learner.batch_size)
         parts_of_batch = [(real, num_real), (imagined, learner.batch_size - num_real)]
-        lesson = lesson_of(parts_of_batch, normalizers, reward_std(imagined, config.normalize_reward))
+        moments = reward_moments(imagined, config.normalize_reward, config.center_reward)
+        lesson = lesson_of(parts_of_batch, normalizers, moments)
         num_updates = config.updates_per_rollout
         learner_state, metrics = train(
             learner, train_key, learner_state, lesson, num_updates, metrics, wanted=~is_random

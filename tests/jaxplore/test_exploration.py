@@ -10,7 +10,7 @@ import pytest
 
 from jaxplore import replay, rewards
 from jaxplore.behaviours import Experience, ImaginationConfig, make_imagination, uniform_actions
-from jaxplore.behaviours.base import lesson_of
+from jaxplore.behaviours.base import AS_THEY_ARE, lesson_of
 from jaxplore.behaviours.imagination import starts
 from jaxplore.beliefs import Belief, FitConfig
 from jaxplore.beliefs.generator import GeneratorConfig
@@ -331,7 +331,7 @@ def test_share_of_real_rows_in_a_draw(fraction, want):
     # two buffers of numbers: positive ones are real
     full = jnp.asarray(np.int32(8))
     real, imagined = (replay.Replay({"x": jnp.asarray(sign * np.arange(1.0, 9))}, 0 * full, full) for sign in (1, -1))
-    lesson = lesson_of([(real, round(16 * fraction)), (imagined, 16 - round(16 * fraction))], None, jnp.ones(()))
+    lesson = lesson_of([(real, round(16 * fraction)), (imagined, 16 - round(16 * fraction))], None, AS_THEY_ARE)
     assert int(jnp.sum(lesson.take(lesson.choose(jax.random.key(0)))["x"] > 0)) == want
 
 
