@@ -10,7 +10,7 @@ import pytest
 
 from jaxplore import replay, rewards
 from jaxplore.behaviours import Experience, ImaginationConfig, make_imagination, uniform_actions
-from jaxplore.behaviours.base import AS_THEY_ARE, lesson_of
+from jaxplore.behaviours.base import AS_THEY_ARE, lesson_of, reward_moments, train
 from jaxplore.behaviours.imagination import starts
 from jaxplore.beliefs import Belief, FitConfig
 from jaxplore.beliefs.generator import GeneratorConfig
@@ -333,6 +333,27 @@ def test_share_of_real_rows_in_a_draw(fraction, want):
     real, imagined = (replay.Replay({"x": jnp.asarray(sign * np.arange(1.0, 9))}, 0 * full, full) for sign in (1, -1))
     lesson = lesson_of([(real, round(16 * fraction)), (imagined, 16 - round(16 * fraction))], None, AS_THEY_ARE)
     assert int(jnp.sum(lesson.take(lesson.choose(jax.random.key(0)))["x"] > 0)) == want
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+@pytest.mark.parametrize("center", [False, True])
+def test_rewards_are_counted_from_their_mean_where_asked(normalize, center):
+    # of the four rows held, whose rewards are 2, 4, 6 and 8: mean 5, variance 5; a learner sees the row's number as obs
+    own, flag = jnp.array([2.0, 4.0, 6.0, 8.0, 9.0, 9.0]), jnp.zeros(6, bool)
+    rows = Transition(jnp.arange(6.0)[:, None], jnp.zeros((6, 1)), own, jnp.zeros((6, 1)), flag, flag)
+    data = replay.Replay(rows, jnp.int32(4), jnp.int32(4))
+    moments = reward_moments(data, normalize, center)
+    assert float(moments.mean) == (5.0 if center else 0.0)
+    assert float(moments.std) == pytest.approx(5**0.5 if normalize else 1.0)
+    learner = recording_learner(Sizes(1, 1), 32)
+    state, _ = train(
+        *(learner, jax.random.key(0), learner.init(jax.random.key(1))),
+        *(lesson_of([(data, 32)], None, moments), 3, {"one": jnp.zeros(())}),
+    )
+    batch = state["batch"]
+    want = (own[batch.obs[:, 0].astype(int)] - moments.mean) / moments.std
+    np.testing.assert_allclose(batch.reward, want, rtol=1e-6)
+    assert int(state["updates"]) == 3 and len(np.unique(batch.obs)) == 4
 
 
 def test_rewards_are_divided_by_their_standard_deviation():
