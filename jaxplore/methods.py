@@ -139,6 +139,13 @@ METHODS: dict[str, Method] = {
         variance_reward,
         planned,
     ),
+    "implicit_reactive": Method(
+        "generator of models, variance reward, SAC on real transitions, relabelled in each round",
+        generator_belief,
+        variance_reward,
+        sac_on_real_data,
+        finite=False,
+    ),
     "implicit_grad": Method(
         "generator of models, variance reward, policy by the reward's own gradient through the models",
         generator_belief,
@@ -151,6 +158,13 @@ METHODS: dict[str, Method] = {
         static_belief,
         variance_reward,
         planned,
+    ),
+    "disagreement_reactive": Method(
+        "static networks, variance reward, SAC on real transitions, relabelled in each round",
+        static_belief,
+        variance_reward,
+        sac_on_real_data,
+        finite=False,
     ),
     "max": Method(
         "static Gaussian networks, Jensen-Renyi divergence (of probabilities Jensen-Shannon), SAC in imagination or "
