@@ -35,8 +35,8 @@ check: $(INSTALLED)
 	@$(BIN)/ruff format --check .
 	@PYRIGHT_PYTHON_IGNORE_WARNINGS=1 PYRIGHT_PYTHON_GLOBAL_NODE=off $(BIN)/pyright
 
-# Every platform, every Python from 3.11 on and every extra but playground, which is 400 MB, in one file; the versions
-# already there are kept where they can be.
+# Every platform, every Python from 3.11 on and the extras that tests need, in one file; playground, peers and wandb are
+# large, and not among them. The versions already there are kept where they can be.
 lock:
 	@test -x $(BIN)/uv || $(MAKE) $(INSTALLED)
 	@$(BIN)/uv pip compile pyproject.toml --extra experiments --extra render --extra robotics \

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 
 def number(value: float | None) -> str:
     """Two digits, or whole numbers from 100 on; `-` for what is not there."""
-    return "-" if value is None else f"{value:.2g}" if abs(value) < 100 else f"{value:,.0f}"
+    # From 99.5 on two digits would be 1e+02.
+    return "-" if value is None else f"{value:.2g}" if abs(value) < 99.5 else f"{value:,.0f}"
 
 
 def duration(seconds: float) -> str:
