@@ -114,7 +114,7 @@ def whole_round(run: RunConfig, rate: float, num_data: int, repeats: int) -> Res
 
     timing = measure_chain(call, programs.init().explorer, repeats=repeats)
     steps, settings = int(config.fit.num_steps(jnp.asarray(num_data))), config.imagination
-    imagined = settings.num_rollouts * settings.horizon
+    imagined = settings.num_rollouts * settings.horizon if settings.real_fraction < 1.0 else 0
     trained = settings.num_rollouts - settings.num_random_rollouts
     updates = settings.real_updates + trained * settings.updates_per_rollout
     flop = steps * svgd_flops(config) + imagined * imagined_flops(config) + updates * sac_flops(config)

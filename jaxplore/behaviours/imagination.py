@@ -50,7 +50,8 @@ class ImaginationConfig:
     """Updates on the real data alone, before imagining. nnaisense/max: 100."""
     real_fraction: float = 0.5
     """Share of each later batch that is real. Paper: the policy is trained on the union of both (Algorithm 1), which
-    does not say how much of a batch is real. 0: imagined data only (nnaisense/max); 1: real data only."""
+    does not say how much of a batch is real. 0: imagined data only (nnaisense/max). 1: real data only; then nothing
+    is imagined."""
     current_fraction: float = 1.0
     """Share of the actors that start where the environment stands; the others start in past states."""
     mover: Mover = "per_step"
@@ -174,7 +175,8 @@ def init(parts: Imagination, key: Key) -> ImaginationState:
 def improve(
     parts: Imagination, key: Key, state: ImaginationState, experience: Experience
 ) -> tuple[ImaginationState, Metrics]:
-    """One round: updates on real data if the configuration wants some, then imagined rollouts with updates after each.
+    """One round: updates on real data if the configuration wants some, then imagined rollouts with updates after each;
+    where batches are all real, these updates without the rollouts.
 
     The round's models are fixed. Metrics are those of the last update and the last rollout.
     """
@@ -187,10 +189,15 @@ def improve(
     real = label(parts.belief, parts.score, experience) if needs_real else experience.data
     obs_size, action_size = parts.example.obs.shape[0], parts.example.action.shape[0]
     learner_state, metrics = state.learner, no_learner_metrics(learner, obs_size, action_size)
-    if config.real_updates > 0:
+    real_updates = config.real_updates
+    if config.real_fraction == 1.0:
+        real_updates += max(config.num_rollouts - config.num_random_rollouts, 0) * config.updates_per_rollout
+    if real_updates > 0:
         moments = reward_moments(real, config.normalize_reward, config.center_reward)
         lesson = lesson_of([(real, learner.batch_size)], normalizers, moments)
-        learner_state, metrics = train(learner, real_key, learner_state, lesson, config.real_updates, metrics)
+        learner_state, metrics = train(learner, real_key, learner_state, lesson, real_updates, metrics)
+    if config.real_fraction == 1.0:
+        return ImaginationState(learner_state, before, state.age + 1), metrics
 
     def one_rollout(i: Array, carry: tuple[Any, Replay[Transition], Metrics, Metrics]) -> tuple[Any, ...]:
         learner_state, imagined, metrics, _ = carry

@@ -356,6 +356,22 @@ def test_rewards_are_counted_from_their_mean_where_asked(normalize, center):
     assert int(state["updates"]) == 3 and len(np.unique(batch.obs)) == 4
 
 
+def test_nothing_is_imagined_where_batches_are_all_real():
+    # as many updates as after rollouts, on rows whose every state is real, with the round's own rewards
+    explorer = fake_explorer(**{**GOING_ON, "real_fraction": 1.0})
+    state = begin(explorer)
+    for number in (1, 2):
+        state, metrics = explorer.improve(jax.random.key(number), state, OBS, 20)
+        assert int(state.behaviour.learner["updates"]) == 4 * number
+        assert int(state.behaviour.imagined.size) == 0 and "policy/imagined_reward" not in metrics
+        batch, rows = state.behaviour.learner["batch"], held(state.data)
+        own, delta = normal(state, rows)
+        index = [int(np.argmin(np.sum((own - obs) ** 2, axis=1))) for obs in np.asarray(batch.obs)]
+        np.testing.assert_allclose(batch.obs, own[index], atol=1e-5)
+        want = SPREAD * (3 * number) ** 2 * np.sum(own**2, axis=1) + 100 * delta[:, 0]
+        np.testing.assert_allclose(batch.reward, (want / np.std(want))[index], rtol=1e-3, atol=1e-3)
+
+
 def test_rewards_are_divided_by_their_standard_deviation():
     # over the imagined data held, by NumPy; the buffer keeps the reward's own units
     explorer = fake_explorer(**GOING_ON)
