@@ -11,6 +11,7 @@ from jaxplore import (
     EnsembleConfig,
     ExplorationConfig,
     FitConfig,
+    GeneratorConfig,
     GradientPolicyConfig,
     ImaginationConfig,
     MCTSConfig,
@@ -108,11 +109,20 @@ DEFAULTS: dict[str, dict[str, Any]] = {
 }
 """Preset -> fields of `RunConfig`."""
 
+ANT_MAZE = dataclasses.replace(
+    LAPTOP,
+    fit=dataclasses.replace(LAPTOP.fit, lr=3e-3),
+    generator=GeneratorConfig(hidden=(64, 16), activation="tanh", num_generators=4),
+    svgd=dataclasses.replace(LAPTOP.svgd, temperature=0.001, repulsion_points="batch"),
+    imagination=dataclasses.replace(LAPTOP.imagination, real_fraction=1.0, keep_imagined=False),
+)
+"""The maze's: features that cannot die, a mixture of generators, and a policy that learns from what happened. See
+`experiments/results/ant_maze_laptop/TUNING.md`."""
+
 ENVIRONMENTS: dict[str, dict[str, dict[str, Any]]] = {
-    # Learning rate: experiments/results/ant_maze_laptop/TUNING.md has what it does to four methods. Observation noise
-    # in nnaisense/max's commands, raw units; the paper is silent.
+    # Observation noise in nnaisense/max's commands, raw units; the paper is silent.
     "ant_maze": {
-        "laptop": {"explorer": dataclasses.replace(LAPTOP, fit=dataclasses.replace(LAPTOP.fit, lr=3e-3))},
+        "laptop": {"explorer": ANT_MAZE},
         "paper": {"obs_noise": 0.02},
     },
     "half_cheetah": {"paper": {"obs_noise": 0.02}},
