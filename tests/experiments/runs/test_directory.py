@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from experiments.runs.scene import Cells, Scene
 from experiments.runs.spec import RunRef, RunSpec
 from experiments.runs.status import Status
 from experiments.training import build
+from jaxplore.config import ExplorationConfig
 from tests.experiments.tiny import ROOT
 
 KEPT = sorted((ROOT / "experiments/results/runs").iterdir())
@@ -153,15 +155,8 @@ def test_a_newer_format_is_refused(tmp_path: Path):
 # Format 0.
 
 
-@pytest.mark.parametrize("path", KEPT, ids=lambda path: path.name)
-def test_every_kept_run_reads(path: Path):
-    directory = RunDirectory(path)
-    old = json.loads((path / "config.json").read_text())
-    config = directory.config()
-    assert (config.env, config.method, config.seed, config.steps) == tuple(
-        old[name] for name in ("env", "method", "seed", "steps")
-    )
-    explorer, was = config.explorer, old["explorer"]
+def check_first_format(explorer: ExplorationConfig, was: dict[str, Any]) -> None:
+    """What the first format says, and what there was no setting for."""
     assert explorer.svgd.num_particles == explorer.ensemble.num_members == was["imagination"]["num_models"] == 32
     assert explorer.reactive.updates == was["reactive_updates"] or (
         was["reactive_updates"] == 0 and explorer.reactive.updates == 300
@@ -172,6 +167,20 @@ def test_every_kept_run_reads(path: Path):
     # what there was no setting for was so
     assert (explorer.generator.activation, explorer.generator.num_generators) == ("relu", 1)
     assert explorer.imagination.keep_imagined
+
+
+@pytest.mark.parametrize("path", KEPT, ids=lambda path: path.name)
+def test_every_kept_run_reads(path: Path):
+    directory = RunDirectory(path)
+    old = json.loads((path / "config.json").read_text())
+    config = directory.config()
+    assert (config.env, config.method, config.seed, config.steps) == tuple(
+        old[name] for name in ("env", "method", "seed", "steps")
+    )
+    if "format" in old:
+        assert json.loads(json.dumps(dataclasses.asdict(config.explorer))) == old["explorer"]
+    else:
+        check_first_format(config.explorer, old["explorer"])
     assert directory.status() is Status.FINISHED and directory.is_kept()
     assert max(row["step"] for row in directory.rows()) == config.steps
     found = directory.scene()
