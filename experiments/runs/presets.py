@@ -115,9 +115,10 @@ ANT_MAZE = dataclasses.replace(
     generator=GeneratorConfig(hidden=(64, 16), activation="tanh", num_generators=4),
     svgd=dataclasses.replace(LAPTOP.svgd, temperature=0.001, repulsion_points="batch"),
     imagination=dataclasses.replace(LAPTOP.imagination, real_fraction=1.0, keep_imagined=False),
+    sac=dataclasses.replace(LAPTOP.sac, alpha=0.05),
 )
-"""The maze's: features that cannot die, a mixture of generators, and a policy that learns from what happened. See
-`experiments/results/ant_maze_laptop/TUNING.md`."""
+"""The maze's: features that cannot die, a mixture of generators, and a policy that learns from what happened, less sure
+of itself. See `experiments/results/ant_maze_laptop/TUNING.md`."""
 
 ENVIRONMENTS: dict[str, dict[str, dict[str, Any]]] = {
     # Observation noise in nnaisense/max's commands, raw units; the paper is silent.
