@@ -72,7 +72,7 @@ def test_no_reward_no_method(
         ("--method=icm --imagination.horizon=5", r"--imagination\.horizon does nothing with method='icm'"),
         (
             "--method=max --svgd.num-particles=4",
-            r"--svgd\.num-particles .* methods implicit, implicit_grad",
+            r"--svgd\.num-particles .* methods implicit, implicit_reactive, implicit_grad",
         ),
         (
             "--mcts.num-iterations=4",
