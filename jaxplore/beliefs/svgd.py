@@ -342,9 +342,7 @@ def update(
     all_inputs = inputs if further is None else _stacked(inputs, further)
 
     thetas, to_eta = jax.vjp(lambda eta: generator.sample(eta, z), state.eta)
-    # Each network with a copy of the inputs: one product for all would come out in an order that has to be turned.
-    copies = jnp.broadcast_to(all_inputs[None], (config.num_particles, *all_inputs.shape))
-    values, to_theta = jax.vjp(lambda thetas: jax.vmap(spec.apply)(thetas, copies), thetas)
+    values, to_theta = jax.vjp(lambda thetas: jax.vmap(spec.apply, in_axes=(0, None))(thetas, all_inputs), thetas)
     start = batch_size if spec.stands_in else 0
     repulsion_values, repulsion_points = values[:, start:], all_inputs[start:]
 

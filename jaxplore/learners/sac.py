@@ -123,9 +123,7 @@ def make_networks(obs_size: int, action_size: int, config: SACConfig) -> SACNetw
 
 def action_values(networks: SACNetworks, params: Params, obs: Array, action: Array) -> Array:
     """Both action values, `[2, ...]`, of `obs [..., O]` and `action [..., A]`; `params` are those of `q`."""
-    # Each network with a copy of the inputs: one product for both would come out in an order that has to be turned.
-    both = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[None], (2, *leaf.shape)), (obs, action))
-    return jax.vmap(lambda one, inputs: apply(networks.value, one, *inputs)[..., 0])(params, both)
+    return jax.vmap(lambda one: apply(networks.value, one, obs, action)[..., 0])(params)
 
 
 def state_value(networks: SACNetworks, params: Params, obs: Array) -> Array:
