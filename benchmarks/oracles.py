@@ -18,12 +18,11 @@ import jax.numpy as jnp
 
 from envs import ant_maze
 from jaxplore import METHODS, Behaviour, ExplorationConfig, Method, Sizes, Transition
-from jaxplore.behaviours.base import Experience, lesson_of, make_act, no_learner_metrics, renewed, reward_moments, train
-from jaxplore.behaviours.real_data import ReactiveState
-from jaxplore.learners import Learner
+from jaxplore.behaviours import Experience
+from jaxplore.behaviours.real_data import make_relabelled
 from jaxplore.parts import make_learner, no_belief, no_reward, reads
 from jaxplore.replay import Replay
-from jaxplore.types import Array, Key, Metrics
+from jaxplore.types import Array
 
 SQUARE = 0.5
 """Side of a square whose visits are counted [m]."""
@@ -65,33 +64,12 @@ def progress(data: Replay[Transition]) -> Array:
 def on_real_data(sizes: Sizes, config: ExplorationConfig, belief: object, score: object, *, rule: Rule) -> Behaviour:
     """SAC on real transitions with a reward by rule, otherwise as `make_reactive`."""
     del belief, score
-    learner, reactive = make_learner(sizes, config), config.reactive
 
-    def init(key: Key) -> ReactiveState:
-        return ReactiveState(learner.init(key), jnp.zeros((), jnp.int32))
-
-    def improve(key: Key, state: ReactiveState, experience: Experience) -> tuple[ReactiveState, Metrics]:
-        init_key, train_key = jax.random.split(key)
-        state = renewed(init_key, state, init, reactive.restart_every)
+    def relabel(experience: Experience) -> Replay[Transition]:
         rows = experience.data.rows._replace(reward=rule(experience.data))
-        real = dataclasses.replace(experience.data, rows=rows)
-        moments = reward_moments(real, reactive.normalize_reward, reactive.center_reward)
-        lesson = lesson_of([(real, learner.batch_size)], experience.normalizers, moments)
-        nothing = no_learner_metrics(learner, sizes.obs, sizes.action)
-        learned, metrics = train(learner, train_key, state.learner, lesson, reactive.updates, nothing)
-        return ReactiveState(learned, state.age + 1), metrics
+        return dataclasses.replace(experience.data, rows=rows)
 
-    return Behaviour(
-        init,
-        improve,
-        actor=functools.partial(_actor, learner),
-        act=make_act(learner, reactive.act_greedily),
-        act_greedily=make_act(learner, True),
-    )
-
-
-def _actor(learner: Learner, state: ReactiveState) -> object:
-    return learner.actor(state.learner)
+    return make_relabelled(relabel, make_learner(sizes, config), sizes.obs, sizes.action, config.reactive)
 
 
 def _behaviour(rule: Rule) -> Callable[..., Behaviour]:

@@ -1,6 +1,7 @@
 """Behaviour on real transitions alone: re-labelled with an intrinsic reward, or with the task's own."""
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -23,8 +24,9 @@ from jaxplore.behaviours.base import (
 )
 from jaxplore.beliefs.base import Belief
 from jaxplore.learners.base import Learner
+from jaxplore.replay import Replay
 from jaxplore.signals.base import Score
-from jaxplore.types import Array, Key, Metrics
+from jaxplore.types import Array, Key, Metrics, Transition
 from jaxplore.validate import Checks
 
 
@@ -63,8 +65,8 @@ class ReactiveState:
 class Reactive(NamedTuple):
     """The fixed parts of the behaviour."""
 
-    belief: Belief
-    score: Score
+    relabel: Callable[[Experience], Replay[Transition]]
+    """`relabel(experience) -> data`, `reward` replaced."""
     learner: Learner
     sizes: tuple[int, int]
     """`O` and `A`."""
@@ -112,9 +114,25 @@ def make_reactive(
     """
     if belief.predict is None:
         raise ValueError("belief predicts nothing, so nothing can be labelled. Allowed: a belief with `predict`.")
+    relabel = functools.partial(label, belief, score)
+    return make_relabelled(relabel, learner, obs_size, action_size, config)
+
+
+def make_relabelled(
+    relabel: Callable[[Experience], Replay[Transition]],
+    learner: Learner,
+    obs_size: int,
+    action_size: int,
+    config: ReactiveConfig | None = None,
+) -> Behaviour:
+    """`make_reactive` with a reward of any kind: `relabel(experience) -> data`, the real data with `reward` replaced.
+
+    Raises:
+        FieldError: a size is below 1.
+    """
     validate.sizes(obs_size=obs_size, action_size=action_size)
     config = config or ReactiveConfig()
-    parts = Reactive(belief, score, learner, (obs_size, action_size), config)
+    parts = Reactive(relabel, learner, (obs_size, action_size), config)
     return Behaviour(
         init=functools.partial(init_reactive, parts),
         improve=functools.partial(improve_reactive, parts),
@@ -136,7 +154,7 @@ def improve_reactive(
     learner, config = parts.learner, parts.config
     init_key, train_key = jax.random.split(key)
     state = renewed(init_key, state, functools.partial(init_reactive, parts), config.restart_every)
-    real = label(parts.belief, parts.score, experience)
+    real = parts.relabel(experience)
     moments = reward_moments(real, config.normalize_reward, config.center_reward)
     lesson = lesson_of([(real, learner.batch_size)], experience.normalizers, moments)
     nothing = no_learner_metrics(learner, *parts.sizes)
