@@ -339,7 +339,7 @@ def update(
     z = state.z if config.redraw == "fixed" else generator.sample_noise(noise_key, config.num_particles)
     batch_size = inputs.shape[0]
     further = further_points(spec, points_key, inputs, extra_inputs)
-    all_inputs = inputs if further is None else _stacked(inputs, further)
+    all_inputs = inputs if further is None else jnp.concatenate([inputs, further])
 
     thetas, to_eta = jax.vjp(lambda eta: generator.sample(eta, z), state.eta)
     values, to_theta = jax.vjp(lambda thetas: jax.vmap(spec.apply, in_axes=(0, None))(thetas, all_inputs), thetas)
@@ -357,7 +357,7 @@ def update(
         prior_scores = _gp_scores(repulsion_points, repulsion_values, config)
         repulsion = repulsion + jnp.einsum("ij,jro->iro", direction.weights, prior_scores)
     if spec.stands_in:
-        value_move = _stacked(direction.drive, repulsion, axis=1)
+        value_move = jnp.concatenate([direction.drive, repulsion], axis=1)
     else:
         value_move = repulsion.at[:, :batch_size].add(direction.drive)
     (theta_move,) = to_theta(value_move)
@@ -382,14 +382,6 @@ def update(
         metrics["dead_features"] = dead_share(generator.features(state.eta, z))
     eta = optax.apply_updates(state.eta, steps)
     return SVGDState(eta=eta, opt_state=opt_state, likelihood_var=likelihood_var, z=z), metrics
-
-
-def _stacked(first: Array, second: Array, axis: int = 0) -> Array:
-    """Both one after the other, each written into place: what is read from a concatenation asks where at each entry."""
-    shape = list(first.shape)
-    shape[axis] += second.shape[axis]
-    whole = jax.lax.dynamic_update_slice_in_dim(jnp.zeros(shape, first.dtype), first, 0, axis)
-    return jax.lax.dynamic_update_slice_in_dim(whole, second, first.shape[axis], axis)
 
 
 def _follow_residuals(likelihood_var: Array, residuals: Array, config: SVGDConfig) -> Array:
