@@ -153,10 +153,11 @@ def features_of(spec: GeneratorSpec, params: Params, z: Array) -> Array:
 
 
 def init_head(config: GeneratorConfig, key: Key, features: Array, centre: np.ndarray, std: float) -> Array:
-    """What maps a layer's features to one leaf, `[size, width + 1]`: a row for each number of the leaf.
+    """What maps a layer's features to one leaf, `[width + 1, size]`: a column for each number of the leaf.
 
-    The bias is the last column, that of a feature which is always 1: its gradient is then part of one matrix product. A
-    leaf has its own so that nothing is cut up and put together again.
+    The bias is the last row, that of a feature which is always 1: its gradient is then part of one matrix product. A
+    leaf has its own so that nothing is cut up and put together again. The long axis is the last, so that what is done
+    entry by entry, as by Adam, runs along it.
 
     Args:
         config: its last hidden width is the features'.
@@ -169,10 +170,10 @@ def init_head(config: GeneratorConfig, key: Key, features: Array, centre: np.nda
     width, size = config.hidden[-1], centre.size
     mean, spread = jnp.mean(features, axis=0), jnp.sum(jnp.var(features, axis=0))
     kernel_std = std * jnp.sqrt((1.0 - config.constant_fraction) / spread)
-    kernel = kernel_std * jax.random.normal(kernel_key, (size, width))
+    kernel = kernel_std * jax.random.normal(kernel_key, (size, width)).T
     constant = std * math.sqrt(config.constant_fraction) * jax.random.normal(bias_key, (size,))
     # Features that are never negative have a mean, and what it comes to is the same for every z.
-    return jnp.concatenate([kernel, (centre + constant - kernel @ mean)[:, None]], axis=1)
+    return jnp.concatenate([kernel, (centre + constant - mean @ kernel)[None]])
 
 
 def init(spec: GeneratorSpec, key: Key) -> Params:
@@ -211,8 +212,11 @@ def generate(spec: GeneratorSpec, eta: Params, z: Array) -> Params:
     for number, (name, indices) in enumerate(spec.layers.items()):
         own_z = z if spec.config.noise == "shared" else z[number]
         inputs = jnp.append(features_of(spec, eta[name]["features"], own_z), 1.0)
+        # Under `vmap` the product by 1 puts a network's inputs into a column. So do their gradients come out, and XLA
+        # then runs a product of two long and thin matrices the quick way round: 60 us in place of 120 for 8 networks.
+        inputs = jnp.eye(inputs.size) @ inputs
         for i in indices:
-            generated[i] = (inputs @ eta[name][str(i)].T).reshape(spec.shapes[i])
+            generated[i] = jnp.einsum("wn,w->n", eta[name][str(i)], inputs).reshape(spec.shapes[i])
     return jax.tree.unflatten(spec.treedef, generated)
 
 

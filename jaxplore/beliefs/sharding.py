@@ -1,7 +1,7 @@
 """A belief's state over several devices, where one is too small for it.
 
-The paper's generator has 53 million parameters for the Ant maze, and with Adam's moments 640 MB; nearly all are rows of
-heads, one for each number of a network. Split over the rows, each device generates its share of every network.
+The paper's generator has 53 million parameters for the Ant maze, and with Adam's moments 640 MB; nearly all are columns
+of heads, one for each number of a network. Split over them, each device generates its share of every network.
 """
 
 import math
@@ -43,7 +43,7 @@ def state_shardings(state: Any, mesh: Mesh, axis: str | None = None, min_size: i
         >>> import jax, jax.numpy as jnp, numpy as np
         >>> from jaxplore import DynamicsConfig, Transition, dynamics, make_generator_belief, replay
         >>> belief = make_generator_belief(3, 1, DynamicsConfig(hidden=(64, 64)))
-        >>> mesh = jax.sharding.Mesh(np.array(jax.devices()), ("rows",))
+        >>> mesh = jax.sharding.Mesh(np.array(jax.devices()), ("columns",))
         >>> shardings = state_shardings(jax.eval_shape(belief.init, jax.random.key(0)), mesh)
         >>> init = jax.jit(belief.init, out_shardings=shardings)
         >>> update = jax.jit(belief.update, donate_argnums=1, out_shardings=(shardings, None))

@@ -123,7 +123,9 @@ def make_networks(obs_size: int, action_size: int, config: SACConfig) -> SACNetw
 
 def action_values(networks: SACNetworks, params: Params, obs: Array, action: Array) -> Array:
     """Both action values, `[2, ...]`, of `obs [..., O]` and `action [..., A]`; `params` are those of `q`."""
-    return jax.vmap(lambda one: apply(networks.value, one, obs, action)[..., 0])(params)
+    # One after the other: under `vmap` XLA makes their first layers one product on CPUs, and turns what comes out.
+    each = (jax.tree.map(lambda leaf, i=i: leaf[i], params) for i in range(2))
+    return jnp.stack([apply(networks.value, one, obs, action)[..., 0] for one in each])
 
 
 def state_value(networks: SACNetworks, params: Params, obs: Array) -> Array:

@@ -22,7 +22,7 @@ def main() -> dict[str, Any]:
         jx.SVGDConfig(num_particles=4),
         jx.FitConfig(batch_size=16),
     )
-    mesh = jax.sharding.Mesh(np.array(jax.devices()), ("rows",))
+    mesh = jax.sharding.Mesh(np.array(jax.devices()), ("columns",))
     shardings = jx.state_shardings(jax.eval_shape(belief.init, jax.random.key(0)), mesh, min_size=1024)
     data, normalizers = random_data(), jx.dynamics.init_normalizers(4, 2)
     key = jax.random.key(2)
