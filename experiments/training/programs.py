@@ -165,8 +165,13 @@ def learn_side_by_side(
     alive: Array,
 ) -> tuple[ExplorerState, Metrics, dict[str, Array]]:
     """`learn_round` of each seed. One that does not come out finite, or is not alive, keeps the state that it had."""
-    one = jax.vmap(functools.partial(learn_round, explorer), in_axes=(0, 0, 0, 0, None))
-    after, metrics, finite = one(keys, state, rows, obs, num_data)
+    learn = functools.partial(learn_round, explorer)
+    if alive.shape[0] == 1:
+        # Not under `vmap`: with an axis more, if only of 1, XLA on CPUs turns matrices that could lie as they are.
+        only = learn(*jax.tree.map(lambda leaf: leaf[0], (keys, state, rows, obs)), num_data)
+        after, metrics, finite = jax.tree.map(lambda leaf: leaf[None], only)
+    else:
+        after, metrics, finite = jax.vmap(learn, in_axes=(0, 0, 0, 0, None))(keys, state, rows, obs, num_data)
     good = jnp.all(jnp.stack(list(finite.values())), axis=0) & alive
 
     def choose(new: Array, old: Array) -> Array:

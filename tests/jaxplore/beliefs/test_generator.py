@@ -118,7 +118,8 @@ def test_sampled_tree_is_the_examples_tree(nested):
     thetas = generator.sample(eta, generator.sample_noise(jax.random.key(2), 4))
     assert jax.tree.map(lambda a: ((4, *a.shape), a.dtype), tree) == jax.tree.map(lambda a: (a.shape, a.dtype), thetas)
     assert sorted(eta) == ["Conv_0", "LayerNorm_0", "inner/hidden_0", "inner/output", "root"]
-    assert sum(head.shape[1] for p in eta.values() for name, head in p.items() if name != "features") == count_params(tree)
+    heads = [head for layer in eta.values() for name, head in layer.items() if name != "features"]
+    assert sum(head.shape[1] for head in heads) == count_params(tree)
     assert run(thetas, ONES).shape == (4, 2)
 
 
@@ -159,7 +160,7 @@ def test_layers_share_their_noise_or_not(noise, linked):
 
 
 def test_layer_order_and_offsets():
-    # each number of theta is one column of its leaf's head, in the leaf's order: with zero kernels, the column's last entry
+    # each number of theta is one column of its leaf's head, in order: with zero kernels, the column's last entry
     tree = {"layer": {"kernel": np.ones((2, 3), np.float32), "bias": np.zeros(3, np.float32)}}
     generator = make_generator(tree, GeneratorConfig(hidden=(4,)))
     shapes = jax.eval_shape(generator.init, jax.random.key(0))
