@@ -113,7 +113,7 @@ def verdict(name: str, method: str, config: ExplorationConfig, steps: int, seed:
     """Fit the belief of a method to the stored transitions of a name, and judge it on all three kinds."""
     stored: Stored = transitions.load(name)
     sizes = Sizes(stored.data.obs.shape[1], stored.data.action.shape[1])
-    belief = METHODS[method].belief(sizes, config)
+    belief = METHODS[method].signal(sizes, config).belief
     if belief.predict is None:
         raise RunError(f"--method={method} has no belief. Allowed: a method with models of the environment.")
     normalizers = normalizers_of(stored.data)

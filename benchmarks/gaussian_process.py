@@ -100,7 +100,7 @@ def _one(method: str, config: ExplorationConfig, steps: int, seed: int) -> tuple
     from benchmarks.beliefs import fit
 
     problem = draw_problem(seed)
-    belief = METHODS[method].belief(Sizes(1, 1), config)
+    belief = METHODS[method].signal(Sizes(1, 1), config).belief
     # One input stands for the observation, the other for the action, and the value for the change.
     data = _as_transitions(problem.inputs, problem.values)
     normalizers = dynamics.Normalizers(*(normalizer.init(1) for _ in range(3)))

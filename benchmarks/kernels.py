@@ -75,7 +75,7 @@ def imagined_step(config: ExplorationConfig, rate: float) -> Result:
             belief,
             models,
             dynamics.init_normalizers(OBS, ACTION),
-            lambda prediction, delta, normalizers: rewards.variance(prediction),
+            lambda seen: rewards.variance(seen.prediction),
         )
         start = jnp.zeros((settings.num_actors, OBS))
         act = lambda act_key, obs: sac.act(act_key, actor, obs)  # noqa: E731

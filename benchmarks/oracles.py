@@ -9,29 +9,21 @@ so that it shows how soon this ant can be at the end of it at all. Both train SA
 of `icm` (`--reactive.*`, `--sac.*`), and model nothing.
 """
 
-import dataclasses
-import functools
-from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from envs import ant_maze
-from jaxplore import METHODS, Behaviour, ExplorationConfig, Method, Sizes, Transition
-from jaxplore.behaviours import Experience
-from jaxplore.behaviours.real_data import make_relabelled
-from jaxplore.parts import make_learner, no_belief, no_reward, reads
-from jaxplore.replay import Replay
-from jaxplore.types import Array
+from jaxplore import METHODS, ExplorationConfig, Method, Normalizers, Replay, Seen, Signal, Sizes, Transition
+from jaxplore.parts import reads, sac_on_real_data
+from jaxplore.types import Array, Metrics
 
 SQUARE = 0.5
 """Side of a square whose visits are counted [m]."""
 LOW, HIGH = -1.0, 5.0
 """The maze's extent in x and y [m]."""
 NUM = round((HIGH - LOW) / SQUARE)
-
-Rule = Callable[[Replay[Transition]], Array]
-"""`rule(data) -> reward` of each row of a buffer, `[capacity]`."""
 
 
 def square_of(obs: Array) -> Array:
@@ -40,12 +32,16 @@ def square_of(obs: Array) -> Array:
     return place[..., 0] * NUM + place[..., 1]
 
 
-def rarity(data: Replay[Transition]) -> Array:
-    """1 / sqrt(visits) of the square that each transition leads to."""
+def visits(data: Replay[Transition]) -> Array:
+    """How many of the transitions held lead to each square, `[NUM ** 2]`."""
     square = square_of(data.rows.next_obs)
     held = jnp.arange(square.shape[0]) < data.size
-    visits = jnp.zeros(NUM * NUM).at[square].add(held.astype(jnp.float32))
-    return jax.lax.rsqrt(jnp.maximum(visits[square], 1.0))
+    return jnp.zeros(NUM * NUM).at[square].add(held.astype(jnp.float32))
+
+
+def rarity(own: Array, seen: Seen) -> Array:
+    """1 / sqrt(visits) of the square that each transition leads to."""
+    return jax.lax.rsqrt(jnp.maximum(own[square_of(seen.transitions.next_obs)], 1.0))
 
 
 def along(obs: Array) -> Array:
@@ -55,40 +51,35 @@ def along(obs: Array) -> Array:
     return jnp.where(y > 3.0, last, jnp.where((x > 3.0) & (y > 0.0), middle, first))
 
 
-def progress(data: Replay[Transition]) -> Array:
-    """Metres along the corridor that each transition made."""
-    return along(data.rows.next_obs) - along(data.rows.obs)
+@reads()
+def counts(sizes: Sizes, config: ExplorationConfig) -> Signal:
+    """A signal: true visits."""
+
+    def fit(own: Array, data: Replay[Transition], normalizers: Normalizers) -> tuple[Array, Metrics]:
+        return visits(data), {}
+
+    return Signal(rarity, "visits ** -0.5", init=lambda key: jnp.zeros(NUM * NUM), fit=fit)
 
 
-@reads("reactive", "sac")
-def on_real_data(sizes: Sizes, config: ExplorationConfig, belief: object, score: object, *, rule: Rule) -> Behaviour:
-    """SAC on real transitions with a reward by rule, otherwise as `make_reactive`."""
-    del belief, score
+@reads()
+def distance(sizes: Sizes, config: ExplorationConfig) -> Signal:
+    """A signal: metres along the corridor that a transition made."""
 
-    def relabel(experience: Experience) -> Replay[Transition]:
-        rows = experience.data.rows._replace(reward=rule(experience.data))
-        return dataclasses.replace(experience.data, rows=rows)
+    def progress(own: Any, seen: Seen) -> Array:
+        return along(seen.transitions.next_obs) - along(seen.transitions.obs)
 
-    return make_relabelled(relabel, make_learner(sizes, config), sizes.obs, sizes.action, config.reactive)
-
-
-def _behaviour(rule: Rule) -> Callable[..., Behaviour]:
-    made = functools.partial(on_real_data, rule=rule)
-    made.reads = on_real_data.reads  # pyright: ignore[reportAttributeAccessIssue, reportFunctionMemberAccess]
-    return made
+    return Signal(progress, "m")
 
 
 METHODS["oracle_counts"] = Method(
     "true visits of squares of 0.5 m as the reward, SAC on real transitions",
-    no_belief,
-    no_reward,
-    _behaviour(rarity),
+    counts,
+    sac_on_real_data,
     actions="continuous",
 )
 METHODS["oracle_distance"] = Method(
     "metres along the corridor as the reward, SAC on real transitions",
-    no_belief,
-    no_reward,
-    _behaviour(progress),
+    distance,
+    sac_on_real_data,
     actions="continuous",
 )

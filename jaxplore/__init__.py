@@ -18,9 +18,8 @@ from jaxplore.behaviours import (
     make_imagination,
     make_mcts,
     make_model_free,
+    make_on_policy,
     make_reactive,
-    make_rnd_learner,
-    make_rnd_ppo,
     make_tree_search,
     make_uniform,
     rollout,
@@ -60,7 +59,18 @@ from jaxplore.learners import (
 from jaxplore.methods import METHODS, Method, get_method
 from jaxplore.policies import load_policy
 from jaxplore.replay import Replay
-from jaxplore.signals import RND, Reward, RNDConfig, make_rnd, rewards
+from jaxplore.signals import (
+    RND,
+    TASK,
+    Reward,
+    RNDConfig,
+    Seen,
+    Signal,
+    make_belief_signal,
+    make_distillation,
+    make_rnd,
+    rewards,
+)
 from jaxplore.types import Transition
 from jaxplore.validate import FieldError
 
@@ -70,6 +80,7 @@ __all__ = [
     "METHODS",
     "PPO",
     "RND",
+    "TASK",
     "Actor",
     "AmortizedSVGD",
     "Behaviour",
@@ -102,6 +113,8 @@ __all__ = [
     "Reward",
     "SACConfig",
     "SVGDConfig",
+    "Seen",
+    "Signal",
     "Sizes",
     "Transition",
     "World",
@@ -109,8 +122,10 @@ __all__ = [
     "get_method",
     "load_policy",
     "make_amortized_svgd",
+    "make_belief_signal",
     "make_ddpg",
     "make_ddqn",
+    "make_distillation",
     "make_ensemble_belief",
     "make_explorer",
     "make_generator",
@@ -120,11 +135,10 @@ __all__ = [
     "make_mcts",
     "make_model_free",
     "make_no_belief",
+    "make_on_policy",
     "make_ppo",
     "make_reactive",
     "make_rnd",
-    "make_rnd_learner",
-    "make_rnd_ppo",
     "make_sac",
     "make_tree_search",
     "make_uniform",

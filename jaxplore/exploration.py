@@ -16,14 +16,13 @@ from flax import struct
 from jaxplore import beliefs, dynamics, replay, validate
 from jaxplore.behaviours.base import Behaviour, Experience
 from jaxplore.behaviours.uniform import uniform_actions
-from jaxplore.beliefs.base import Belief
 from jaxplore.config import ExplorationConfig, Sizes
 from jaxplore.dynamics import Normalizers
 from jaxplore.methods import Method, check_fits
 from jaxplore.parts import divergence_reward
 from jaxplore.replay import Replay
 from jaxplore.signals import rewards
-from jaxplore.signals.base import Reward, Score
+from jaxplore.signals.base import Score, Signal
 from jaxplore.types import Array, Key, Metrics, Transition
 from jaxplore.validate import FieldError
 
@@ -37,6 +36,8 @@ class ExplorerState:
     data: Replay[Transition]
     """Real transitions."""
     normalizers: Normalizers
+    signal: Any = ()
+    """What the signal carries beside the belief, unless the behaviour carries it."""
 
 
 @struct.dataclass
@@ -119,9 +120,9 @@ def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Ex
             "DynamicsConfig",
         )
     check_fits(method, sizes)
-    belief, reward = method.belief(sizes, config), method.reward(config)
-    behaviour = method.behaviour(sizes, config, belief, reward.score)
-    agent = Agent(belief, reward, divergence_reward(config).score, behaviour, sizes, config.data_capacity)
+    signal = method.signal(sizes, config)
+    behaviour = method.behaviour(sizes, config, signal)
+    agent = Agent(signal, divergence_reward(config).score, behaviour, sizes, config.data_capacity)
     return Explorer(
         init=functools.partial(init, agent),
         actor=functools.partial(actor, agent),
@@ -132,20 +133,24 @@ def make_explorer(method: Method, sizes: Sizes, config: ExplorationConfig) -> Ex
         improve=functools.partial(improve, agent),
         assess=functools.partial(assess, agent),
         adopt=functools.partial(adopt, agent) if behaviour.adopt else None,
-        reward_unit=reward.unit if belief.predict else behaviour.bonus.unit if behaviour.bonus else None,
+        reward_unit=signal.unit,
     )
 
 
 class Agent(NamedTuple):
     """The fixed parts of an explorer."""
 
-    belief: Belief
-    reward: Reward
+    signal: Signal
     divergence: Score
     """Logged of every belief."""
     behaviour: Behaviour
     sizes: Sizes
     data_capacity: int
+
+    @property
+    def carries(self) -> bool:
+        """Whether it carries, and fits, something of the signal's beside the belief: not if the behaviour does."""
+        return self.signal.init is not None and self.behaviour.score is None
 
 
 def init(agent: Agent, key: Key) -> ExplorerState:
@@ -154,11 +159,17 @@ def init(agent: Agent, key: Key) -> ExplorerState:
     flag = jnp.zeros((), bool)
     example = Transition(jnp.zeros(sizes.obs), jnp.zeros(sizes.action), jnp.zeros(()), jnp.zeros(sizes.obs), flag, flag)
     belief_key, behaviour_key = jax.random.split(key)
+    own = ()
+    if agent.carries:
+        assert agent.signal.init is not None
+        behaviour_key, own_key = jax.random.split(behaviour_key)
+        own = agent.signal.init(own_key)
     return ExplorerState(
-        belief=agent.belief.init(belief_key),
+        belief=agent.signal.belief.init(belief_key),
         behaviour=agent.behaviour.init(behaviour_key),
         data=replay.init(example, agent.data_capacity),
         normalizers=dynamics.init_normalizers(sizes.obs, sizes.action),
+        signal=own,
     )
 
 
@@ -204,24 +215,27 @@ def observe(state: ExplorerState, transitions: Transition, valid: Array) -> Expl
 
 
 def improve(agent: Agent, key: Key, state: ExplorerState, obs: Array, num_data: Array) -> tuple[ExplorerState, Metrics]:
-    """Fit the belief, draw models from it, improve the behaviour (Algorithm 1, lines 5 to 9)."""
-    belief, behaviour = agent.belief, agent.behaviour
+    """Fit the belief and the signal, draw models, improve the behaviour (Algorithm 1, lines 5 to 9)."""
+    belief, behaviour = agent.signal.belief, agent.behaviour
     validate.shape("obs", obs, agent.sizes.obs)
     fit_key, models_key, improve_key = jax.random.split(key, 3)
     fitted, fit_metrics = beliefs.fit(belief, fit_key, state.belief, state.data, state.normalizers, num_data)
     models = belief.sample(models_key, fitted, belief.num_models)
-    experience = Experience(models, state.data, num_data, state.normalizers, obs)
+    own, own_metrics = state.signal, {}
+    if agent.carries:
+        own, own_metrics = agent.signal.fit(own, state.data, state.normalizers)
+    experience = Experience(models, state.data, num_data, state.normalizers, obs, own)
     improved, metrics = behaviour.improve(improve_key, state.behaviour, experience)
-    return dataclasses.replace(state, belief=fitted, behaviour=improved), {
+    return dataclasses.replace(state, belief=fitted, behaviour=improved, signal=own), {
         **{f"fit/{name}": value for name, value in fit_metrics.items()},
-        **{f"policy/{name}": value for name, value in metrics.items()},
+        **{f"policy/{name}": value for name, value in (metrics | own_metrics).items()},
     }
 
 
 def assess(agent: Agent, key: Key, state: ExplorerState, transitions: Transition, valid: Array) -> Metrics:
     """What transitions `[T, ...]` that have not been learned from are worth; see `Explorer.assess`."""
-    belief, bonus = agent.belief, agent.behaviour.bonus
-    if belief.predict is None and bonus is None:
+    signal, belief = agent.signal, agent.signal.belief
+    if belief.predict is None and signal.score is None:
         return {}
     validate.shape("transitions.obs", transitions.obs, "T", agent.sizes.obs)
     validate.shape("valid", valid, transitions.obs.shape[0])
@@ -230,19 +244,21 @@ def assess(agent: Agent, key: Key, state: ExplorerState, transitions: Transition
     order = jnp.argsort(~valid)[jnp.arange(valid.shape[0]) % jnp.maximum(count, 1)]
     rows = jax.tree.map(lambda leaf: leaf[order], transitions)
     counts = jnp.arange(valid.shape[0]) < count
-    if belief.predict is None:
-        assert bonus is not None
-        given = bonus.score(state.behaviour, state.normalizers, rows)
-        return _spread("intrinsic_reward", jnp.where(counts, given, jnp.nan))
     models = belief.sample(key, state.belief, belief.num_models)
-    prediction, delta = belief.judge(models, state.normalizers, rows)
-    of_each = {
-        "intrinsic_reward": agent.reward.score(prediction, delta, state.normalizers),
-        "variance": rewards.variance(prediction),
-        "divergence": agent.divergence(prediction, delta, state.normalizers),
-    }
     metrics = {}
-    for name, values in of_each.items():
+    if agent.behaviour.score:
+        given = agent.behaviour.score(state.behaviour, state.normalizers, rows)
+        metrics |= _spread("intrinsic_reward", jnp.where(counts, given, jnp.nan))
+    elif signal.score:
+        given = signal.judge(models, state.signal, state.normalizers, rows)
+        metrics |= _spread("intrinsic_reward", jnp.where(counts, given, jnp.nan))
+    if belief.predict is None:
+        return metrics
+    prediction, delta = belief.judge(models, state.normalizers, rows)
+    for name, values in (
+        ("variance", rewards.variance(prediction)),
+        ("divergence", agent.divergence(prediction, delta, state.normalizers)),
+    ):
         metrics |= _spread(name, jnp.where(counts, values, jnp.nan))
     errors = jnp.mean((jnp.mean(prediction.mean, axis=0) - delta) ** 2, axis=-1)
     return {**metrics, "model_error": jnp.nanmean(jnp.where(counts, errors, jnp.nan))}

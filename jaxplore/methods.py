@@ -1,7 +1,9 @@
-"""The methods table: a method is a belief, an intrinsic reward, and a way to turn the reward into behaviour.
+"""The methods table: a method is a signal, which says how interesting a transition is, and a behaviour that turns it
+into actions.
 
-Everything else is shared. Where actions are discrete, double DQN stands in for the SAC of a method. To add a method,
-add a row; what it needs and `jaxplore.parts` does not offer is one new factory.
+A signal is an intrinsic reward read off a belief over the dynamics, random network distillation, or the task's own
+reward. Everything else is shared. Where actions are discrete, double DQN stands in for the SAC of a method. To add a
+method, add a row; what it needs and `jaxplore.parts` does not offer is one new factory.
 """
 
 import dataclasses
@@ -10,30 +12,32 @@ from typing import Literal, NamedTuple
 
 from jaxplore import validate
 from jaxplore.behaviours.base import Behaviour
-from jaxplore.beliefs.base import Belief
 from jaxplore.config import ExplorationConfig, Sizes
 from jaxplore.parts import (
-    ddpg_on_task_reward,
-    ddqn_on_task_reward,
-    distillation_with_ppo,
-    distillation_with_sac,
+    distillation,
+    distillation_beside,
     divergence_reward,
     error_reward,
+    fields_read,
     gaussian_belief,
     generator_belief,
-    no_belief,
-    no_reward,
+    lasting_sac_on_real_data,
+    model_free_ddpg,
+    model_free_ddqn,
+    model_free_sac,
     planned,
+    ppo_on_own_steps,
+    read_off,
     reward_gradient,
     sac_in_imagination,
     sac_on_real_data,
-    sac_on_task_reward,
     spread_reward,
     static_belief,
+    task_reward,
     uniform_actions,
     variance_reward,
 )
-from jaxplore.signals.base import Reward, Score
+from jaxplore.signals.base import Signal
 
 Actions = Literal["any", "continuous", "discrete"]
 
@@ -43,9 +47,8 @@ class Method(NamedTuple):
 
     summary: str
     """What it is, for `--help` and tables."""
-    belief: Callable[[Sizes, ExplorationConfig], Belief]
-    reward: Callable[[ExplorationConfig], Reward]
-    behaviour: Callable[[Sizes, ExplorationConfig, Belief, Score], Behaviour]
+    signal: Callable[[Sizes, ExplorationConfig], Signal]
+    behaviour: Callable[[Sizes, ExplorationConfig, Signal], Behaviour]
     needs_reward: bool = False
     """Whether it learns from the environment's own reward."""
     actions: Actions = "any"
@@ -77,14 +80,7 @@ class Method(NamedTuple):
         return numbers | {name for name in choices - numbers if getattr(config, name) != getattr(defaults, name)}
 
     def _reads(self, config: ExplorationConfig, discrete: bool) -> frozenset[str]:
-        found = set(SHARED)
-        for part in (self.belief, self.reward):
-            own = getattr(part, "reads", None)
-            found |= set(own(config)) if own else {item.name for item in dataclasses.fields(config)}
-        own = getattr(self.behaviour, "reads", None)
-        found |= set(own(config, discrete)) if own else {item.name for item in dataclasses.fields(config)}
-        # Of every belief the divergence is logged, too.
-        return frozenset(found if self.belief is no_belief else found | {"renyi_decay"})
+        return frozenset({*SHARED, *fields_read(self.signal, config), *fields_read(self.behaviour, config, discrete)})
 
 
 def _finite(sizes: Sizes) -> bool:
@@ -135,147 +131,134 @@ def as_max_prediction_error(config: ExplorationConfig) -> ExplorationConfig:
 METHODS: dict[str, Method] = {
     "implicit": Method(
         "generator of models trained by amortised SVGD, variance reward, SAC in imagination or tree search",
-        generator_belief,
-        variance_reward,
+        read_off(generator_belief, variance_reward),
         planned,
     ),
     "implicit_reactive": Method(
         "generator of models, variance reward, SAC on real transitions, relabelled in each round",
-        generator_belief,
-        variance_reward,
+        read_off(generator_belief, variance_reward),
         sac_on_real_data,
         finite=False,
     ),
     "implicit_grad": Method(
         "generator of models, variance reward, policy by the reward's own gradient through the models",
-        generator_belief,
-        variance_reward,
+        read_off(generator_belief, variance_reward),
         reward_gradient,
         actions="continuous",
     ),
     "disagreement": Method(
         "static networks, variance reward, SAC in imagination or tree search",
-        static_belief,
-        variance_reward,
+        read_off(static_belief, variance_reward),
         planned,
     ),
     "disagreement_reactive": Method(
         "static networks, variance reward, SAC on real transitions, relabelled in each round",
-        static_belief,
-        variance_reward,
+        read_off(static_belief, variance_reward),
         sac_on_real_data,
         finite=False,
     ),
     "max": Method(
         "static Gaussian networks, Jensen-Renyi divergence (of probabilities Jensen-Shannon), SAC in imagination or "
         "tree search",
-        gaussian_belief,
-        divergence_reward,
+        read_off(gaussian_belief, divergence_reward),
         planned,
         settings=as_max,
     ),
     "max_reactive": Method(
         "static Gaussian networks, Jensen-Renyi divergence, SAC on real transitions (JDRX of nnaisense/max)",
-        gaussian_belief,
-        divergence_reward,
+        read_off(gaussian_belief, divergence_reward),
         sac_on_real_data,
         settings=as_max_reactive,
         finite=False,
     ),
     "max_trajectory": Method(
         "static Gaussian networks, spread of the imagined changes, SAC in imagination (TVAX of nnaisense/max)",
-        gaussian_belief,
-        spread_reward,
+        read_off(gaussian_belief, spread_reward),
         sac_in_imagination,
         settings=as_max_trajectory,
         finite=False,
     ),
     "prediction_error": Method(
         "static Gaussian networks, error of their mean, SAC on real transitions (PERX of nnaisense/max)",
-        gaussian_belief,
-        error_reward,
+        read_off(gaussian_belief, error_reward),
         sac_on_real_data,
         settings=as_max_prediction_error,
         finite=False,
     ),
     "icm": Method(
         "static networks, error of their mean, SAC on real transitions with as many updates as in imagination",
-        static_belief,
-        error_reward,
+        read_off(static_belief, error_reward),
         sac_on_real_data,
         finite=False,
     ),
     "icm_active": Method(
         "static networks, error of their mean, SAC in imagination, where a model stands for the truth",
-        static_belief,
-        error_reward,
+        read_off(static_belief, error_reward),
         sac_in_imagination,
         finite=False,
     ),
     "disagreement_grad": Method(
         "static networks, variance reward, policy by the reward's own gradient through the models",
-        static_belief,
-        variance_reward,
+        read_off(static_belief, variance_reward),
         reward_gradient,
         actions="continuous",
     ),
     "rnd": Method(
         "random network distillation with PPO, as published",
-        no_belief,
-        no_reward,
-        distillation_with_ppo,
+        distillation,
+        ppo_on_own_steps,
         actions="continuous",
     ),
     "rnd_sac": Method(
         "random network distillation with SAC on real transitions, as an ablation",
-        no_belief,
-        no_reward,
-        distillation_with_sac,
+        distillation,
+        lasting_sac_on_real_data,
+        finite=False,
+    ),
+    "rnd_active": Method(
+        "random network distillation with SAC in imagination, by static networks",
+        distillation_beside(static_belief),
+        sac_in_imagination,
         finite=False,
     ),
     "ddqn": Method(
         "double DQN with epsilon-greedy actions on the environment's own reward, for discrete actions",
-        no_belief,
-        no_reward,
-        ddqn_on_task_reward,
+        task_reward,
+        model_free_ddqn,
         needs_reward=True,
         actions="discrete",
     ),
     "psne": Method(
         "DDPG with adaptive noise in the policy's parameters, on the environment's own reward",
-        no_belief,
-        no_reward,
-        ddpg_on_task_reward,
+        task_reward,
+        model_free_ddpg,
         needs_reward=True,
         actions="continuous",
     ),
     "psne_no_norm": Method(
         "psne without layer normalisation, as an ablation",
-        no_belief,
-        no_reward,
-        ddpg_on_task_reward,
+        task_reward,
+        model_free_ddpg,
         needs_reward=True,
         actions="continuous",
         settings=as_baselines_default,
     ),
     "sac": Method(
         "SAC with a fixed entropy weight on the environment's own reward",
-        no_belief,
-        no_reward,
-        sac_on_task_reward,
+        task_reward,
+        model_free_sac,
         needs_reward=True,
         actions="continuous",
     ),
     "sac_v2": Method(
         "SAC with a learned entropy weight on the environment's own reward",
-        no_belief,
-        no_reward,
-        sac_on_task_reward,
+        task_reward,
+        model_free_sac,
         needs_reward=True,
         actions="continuous",
         settings=as_sac_v2,
     ),
-    "random": Method("uniform random actions", no_belief, no_reward, uniform_actions),
+    "random": Method("uniform random actions", task_reward, uniform_actions),
 }
 """Name -> method. Add your own with `METHODS["mine"] = Method(...)`."""
 

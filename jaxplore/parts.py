@@ -1,4 +1,4 @@
-"""The parts that a method is made of, each from the configuration: beliefs, rewards and behaviours.
+"""The parts that a method is made of, each from the configuration: signals, of beliefs and rewards, and behaviours.
 
 Each says by `reads` which fields of the configuration it looks at, so that a setting which does nothing is refused and
 not ignored.
@@ -6,16 +6,16 @@ not ignored.
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeAlias
 
 from jaxplore.behaviours.base import Behaviour
-from jaxplore.behaviours.distillation import make_rnd_learner, make_rnd_ppo
 from jaxplore.behaviours.gradient import make_gradient_policy
 from jaxplore.behaviours.imagination import make_imagination
+from jaxplore.behaviours.on_policy import make_on_policy
 from jaxplore.behaviours.real_data import make_model_free, make_reactive
 from jaxplore.behaviours.tree_search import make_tree_search
 from jaxplore.behaviours.uniform import make_uniform
-from jaxplore.beliefs.base import Belief, make_no_belief
+from jaxplore.beliefs.base import Belief
 from jaxplore.beliefs.ensemble import make_ensemble_belief
 from jaxplore.beliefs.implicit import make_generator_belief
 from jaxplore.config import ExplorationConfig, Sizes
@@ -25,8 +25,9 @@ from jaxplore.learners.ddpg import make_ddpg
 from jaxplore.learners.ddqn import make_ddqn
 from jaxplore.learners.sac import make_sac
 from jaxplore.signals import rewards
-from jaxplore.signals.base import Reward, Score
-from jaxplore.signals.task import NO_REWARD
+from jaxplore.signals.base import Reward, Signal, make_belief_signal
+from jaxplore.signals.distillation import make_distillation
+from jaxplore.signals.task import TASK
 from jaxplore.types import Array
 from jaxplore.validate import FieldError
 
@@ -50,6 +51,12 @@ def reads(*fields: Any, discrete: tuple[str, ...] | None = None) -> Callable[[An
         return part
 
     return mark
+
+
+def fields_read(part: Any, config: Any, *discrete: bool) -> set[str]:
+    """The names of the fields that a part reads; of one that does not say so: all."""
+    own = getattr(part, "reads", None)
+    return set(own(config, *discrete)) if own else {item.name for item in dataclasses.fields(ExplorationConfig)}
 
 
 def make_learner(sizes: Sizes, config: ExplorationConfig) -> Learner:
@@ -86,12 +93,6 @@ def _ensemble(sizes: Sizes, config: ExplorationConfig, *, gaussian: bool) -> Bel
         ensemble_config=config.ensemble,
         fit_config=config.fit,
     )
-
-
-@reads()
-def no_belief(sizes: Sizes, config: ExplorationConfig) -> Belief:
-    """No model of the environment."""
-    return make_no_belief()
 
 
 @reads("reward_units", "dynamics")
@@ -136,30 +137,86 @@ def spread_reward(config: ExplorationConfig) -> Reward:
     return Reward(lambda prediction, delta, normalizers: rewards.trajectory_spread(delta), "normalised delta")
 
 
+MakeBelief: TypeAlias = Callable[[Sizes, ExplorationConfig], Belief]
+MakeReward: TypeAlias = Callable[[ExplorationConfig], Reward]
+MakeSignal: TypeAlias = Callable[[Sizes, ExplorationConfig], Signal]
+
+
+def read_off(belief: MakeBelief, reward: MakeReward) -> MakeSignal:
+    """A signal: the intrinsic reward read off what the belief's models predict."""
+
+    @reads(lambda config, discrete=False: _read_by_belief(belief, config) | fields_read(reward, config))
+    def signal(sizes: Sizes, config: ExplorationConfig) -> Signal:
+        return make_belief_signal(belief(sizes, config), reward(config))
+
+    return signal
+
+
+def _read_by_belief(belief: MakeBelief, config: Any) -> set[str]:
+    # Of every belief the divergence is logged, too.
+    return fields_read(belief, config) | {"renyi_decay"}
+
+
+@reads("rnd")
+def distillation(sizes: Sizes, config: ExplorationConfig) -> Signal:
+    """A signal: random network distillation, on real transitions."""
+    return _distillation(sizes, config)
+
+
+def distillation_beside(belief: MakeBelief) -> MakeSignal:
+    """A signal: random network distillation, on transitions that the belief's models imagine, too."""
+
+    @reads(lambda config, discrete=False: _read_by_belief(belief, config) | {"rnd"})
+    def signal(sizes: Sizes, config: ExplorationConfig) -> Signal:
+        return _distillation(sizes, config, belief(sizes, config))
+
+    return signal
+
+
+def _distillation(sizes: Sizes, config: ExplorationConfig, belief: Belief | None = None) -> Signal:
+    # What came last follows from where the replay writes, which must not wrap around within a round.
+    if config.data_capacity <= config.steps_per_round:
+        allowed = f"at least steps_per_round + 1 = {config.steps_per_round + 1}"
+        problem = "holds no more than a round"
+        raise FieldError("data_capacity", config.data_capacity, allowed, problem, "ExplorationConfig")
+    return make_distillation(sizes.obs, config.steps_per_round, config.rnd, belief)
+
+
 @reads()
-def no_reward(config: ExplorationConfig) -> Reward:
-    """No intrinsic reward."""
-    return NO_REWARD
+def task_reward(sizes: Sizes, config: ExplorationConfig) -> Signal:
+    """The environment's own reward, as real transitions have it; for a behaviour that seeks nothing, no signal."""
+    return TASK
 
 
 @reads("imagination", "sac", discrete=("imagination", "ddqn"))
-def sac_in_imagination(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
+def sac_in_imagination(sizes: Sizes, config: ExplorationConfig, signal: Signal) -> Behaviour:
     """SAC, or double DQN where actions are discrete, trained in rollouts that the belief's models imagine."""
     learner = make_learner(sizes, config)
-    return make_imagination(belief, score, learner, sizes.obs, sizes.action, config.imagination, sizes.discrete)
+    return make_imagination(signal, learner, sizes.obs, sizes.action, config.imagination, sizes.discrete)
 
 
 @reads("reactive", "sac", discrete=("reactive", "ddqn"))
-def sac_on_real_data(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
+def sac_on_real_data(sizes: Sizes, config: ExplorationConfig, signal: Signal) -> Behaviour:
     """SAC, or double DQN where actions are discrete, on real transitions, relabelled in each round; nothing is
     imagined.
     """
+    return make_reactive(signal, make_learner(sizes, config), sizes.obs, sizes.action, config.reactive)
+
+
+STD_DRAWS = 1024
+"""Real transitions over which a lasting policy's rewards have their standard deviation taken."""
+
+
+@reads("reactive", "sac", discrete=("reactive", "ddqn"))
+def lasting_sac_on_real_data(sizes: Sizes, config: ExplorationConfig, signal: Signal) -> Behaviour:
+    """The same with a policy that is never replaced, whatever `reactive.restart_every` is."""
     learner = make_learner(sizes, config)
-    return make_reactive(belief, score, learner, sizes.obs, sizes.action, config.reactive)
+    options = {"lasting": True, "std_draws": STD_DRAWS}
+    return make_reactive(signal, learner, sizes.obs, sizes.action, config.reactive, **options)
 
 
 @reads("mcts")
-def tree_search(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
+def tree_search(sizes: Sizes, config: ExplorationConfig, signal: Signal) -> Behaviour:
     """Tree search in the belief's models at each real step. Refuses all but finitely many states and actions."""
     if not (sizes.discrete and sizes.one_hot_obs):
         raise FieldError(
@@ -169,7 +226,7 @@ def tree_search(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: 
             "searches finitely many states and actions; here actions are numbers or observations are not one-hot",
             "ExplorationConfig",
         )
-    return make_tree_search(belief, score, sizes.obs, sizes.action, config.mcts)
+    return make_tree_search(signal, sizes.obs, sizes.action, config.mcts)
 
 
 PLANNERS: dict[str, Any] = {
@@ -180,7 +237,7 @@ PLANNERS: dict[str, Any] = {
 
 
 @reads(lambda config, discrete=False: {"planner"} | PLANNERS[config.planner].reads(config, discrete))
-def planned(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
+def planned(sizes: Sizes, config: ExplorationConfig, signal: Signal) -> Behaviour:
     """The behaviour that the configuration names, for methods that plan in their models. Finitely many states and
     actions are searched, not learned.
     """
@@ -188,67 +245,49 @@ def planned(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Scor
         given = f"an observation is one of {sizes.obs} states and an action one of {sizes.action} choices"
         problem = f"is for observations or actions that are numbers; here {given}"
         raise FieldError("planner", "sac", "planner='mcts'", problem, "ExplorationConfig")
-    return PLANNERS[config.planner](sizes, config, belief, score)
+    return PLANNERS[config.planner](sizes, config, signal)
 
 
 @reads("gradient")
-def reward_gradient(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
+def reward_gradient(sizes: Sizes, config: ExplorationConfig, signal: Signal) -> Behaviour:
     """A policy by gradient ascent on the reward, through the belief's models."""
-    return make_gradient_policy(belief, score, sizes.obs, sizes.action, config.gradient)
+    return make_gradient_policy(signal, sizes.obs, sizes.action, config.gradient)
 
 
-@reads("rnd", "ppo")
-def distillation_with_ppo(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
-    """Random network distillation as published: PPO on the real steps of its own policy."""
-    _check_replay_keeps_a_round(config)
-    return make_rnd_ppo(sizes.obs, sizes.action, config.steps_per_round, config.warm_up_steps, config.ppo, config.rnd)
-
-
-@reads("rnd", "reactive", "sac", discrete=("rnd", "reactive", "ddqn"))
-def distillation_with_sac(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
-    """Random network distillation with SAC, or double DQN where actions are discrete, on all real transitions, as many
-    updates as other methods have.
-    """
-    _check_replay_keeps_a_round(config)
-    learner = make_learner(sizes, config)
-    return make_rnd_learner(learner, sizes.obs, config.steps_per_round, config.reactive, config.rnd)
-
-
-def _check_replay_keeps_a_round(config: ExplorationConfig) -> None:
-    """What came last follows from where the replay writes, which must not wrap around within a round."""
-    if config.data_capacity <= config.steps_per_round:
-        allowed = f"at least steps_per_round + 1 = {config.steps_per_round + 1}"
-        problem = "holds no more than a round"
-        raise FieldError("data_capacity", config.data_capacity, allowed, problem, "ExplorationConfig")
+@reads("ppo")
+def ppo_on_own_steps(sizes: Sizes, config: ExplorationConfig, signal: Signal) -> Behaviour:
+    """PPO on the real steps of its own policy, and the signal with it."""
+    per_round, warm_up = config.steps_per_round, config.warm_up_steps
+    return make_on_policy(signal, sizes.obs, sizes.action, per_round, warm_up, config.ppo)
 
 
 @reads()
-def uniform_actions(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
+def uniform_actions(sizes: Sizes, config: ExplorationConfig, signal: Signal) -> Behaviour:
     """Uniform random actions."""
     return make_uniform(sizes.action, sizes.discrete)
 
 
-def _on_task_reward(learner: Learner, sizes: Sizes, config: ExplorationConfig) -> Behaviour:
-    """A learner on real transitions, with the environment's own reward. One-hot observations stay as they are."""
+def _model_free(learner: Learner, sizes: Sizes, config: ExplorationConfig, signal: Signal) -> Behaviour:
+    """A learner that lasts, on real transitions. One-hot observations stay as they are."""
     model_free = dataclasses.replace(
         config.model_free, normalize_obs=config.model_free.normalize_obs and not sizes.one_hot_obs
     )
-    return make_model_free(learner, sizes.obs, sizes.action, model_free)
+    return make_model_free(learner, sizes.obs, sizes.action, model_free, signal)
 
 
 @reads("model_free", "ddqn")
-def ddqn_on_task_reward(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
-    """Double DQN on the environment's own reward."""
-    return _on_task_reward(make_ddqn(sizes.obs, sizes.action, config.ddqn), sizes, config)
+def model_free_ddqn(sizes: Sizes, config: ExplorationConfig, signal: Signal) -> Behaviour:
+    """Double DQN that lasts, on real transitions."""
+    return _model_free(make_ddqn(sizes.obs, sizes.action, config.ddqn), sizes, config, signal)
 
 
 @reads("model_free", "ddpg")
-def ddpg_on_task_reward(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
-    """DDPG with adaptive parameter noise on the environment's own reward."""
-    return _on_task_reward(make_ddpg(sizes.obs, sizes.action, config.ddpg), sizes, config)
+def model_free_ddpg(sizes: Sizes, config: ExplorationConfig, signal: Signal) -> Behaviour:
+    """DDPG with adaptive parameter noise that lasts, on real transitions."""
+    return _model_free(make_ddpg(sizes.obs, sizes.action, config.ddpg), sizes, config, signal)
 
 
 @reads("model_free", "task_sac")
-def sac_on_task_reward(sizes: Sizes, config: ExplorationConfig, belief: Belief, score: Score) -> Behaviour:
-    """SAC on the environment's own reward."""
-    return _on_task_reward(make_sac(sizes.obs, sizes.action, config.task_sac), sizes, config)
+def model_free_sac(sizes: Sizes, config: ExplorationConfig, signal: Signal) -> Behaviour:
+    """SAC that lasts, with the settings for a task's reward, on real transitions."""
+    return _model_free(make_sac(sizes.obs, sizes.action, config.task_sac), sizes, config, signal)

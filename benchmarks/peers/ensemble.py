@@ -20,7 +20,7 @@ from benchmarks.peers.common import Line, torch_on_one_thread
 from benchmarks.result import widths
 from benchmarks.timing import measure_pairs
 from experiments.runs.presets import preset_config
-from jaxplore import ExplorationConfig, World, dynamics, make_ensemble_belief, make_sac, rewards, rollout
+from jaxplore import ExplorationConfig, Seen, World, dynamics, make_ensemble_belief, make_sac, rewards, rollout
 from jaxplore.beliefs import Belief
 from jaxplore.dynamics import LOG_VAR_BOUNDS
 from jaxplore.signals.rewards import MAX_VAR
@@ -95,8 +95,8 @@ def ours_imagined(config: ExplorationConfig) -> Callable[[], Any]:
 
     @jax.jit
     def roll(key: jax.Array, models: Any, actor: Any) -> Any:
-        def score(prediction: Any, delta: jax.Array, normalizers: Any) -> jax.Array:
-            return rewards.jensen_renyi(prediction, config.renyi_decay)
+        def score(seen: Seen) -> jax.Array:
+            return rewards.jensen_renyi(seen.prediction, config.renyi_decay)
 
         world = World(belief, models, dynamics.init_normalizers(OBS, ACTION), score)
         return rollout(key, lambda act_key, obs: sac.act(act_key, actor, obs), world, start, HORIZON)

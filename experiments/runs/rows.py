@@ -1,7 +1,8 @@
 """The schema of a run's rows: every field of `metrics.jsonl`, its unit and what it means.
 
 A row is one round of one seed. Fields that a method has no use for are left out. `fit/` are a belief's own words on its
-last gradient step of the round, `policy/` a behaviour's on its last update, `eval/` an evaluation's.
+last gradient step of the round, `policy/` a behaviour's on its last update, and those of a signal that learns without a
+belief, `eval/` an evaluation's.
 """
 
 import math

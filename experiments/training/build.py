@@ -54,7 +54,7 @@ def make_agent(config: RunConfig, env: Environment) -> Explorer:
 
 def make_belief(config: RunConfig, env: Environment) -> Belief:
     """That agent's belief, to be asked."""
-    return get_method(config.method).belief(sizes_of(env), config.explorer)
+    return get_method(config.method).signal(sizes_of(env), config.explorer).belief
 
 
 def make_scene(config: RunConfig, env: Environment, agent: Explorer) -> Scene:

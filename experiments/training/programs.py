@@ -150,6 +150,7 @@ def learn_round(
     after, metrics = explorer.improve(improve_key, explorer.observe(state, *rows), obs, num_data)
     # The state too: what the last update of a round broke would show in the next round's metrics only.
     parts = {"belief": after.belief, "behaviour": after.behaviour, "normalizers": after.normalizers}
+    parts["signal"] = after.signal
     finite = {name: jnp.isfinite(value) for name, value in metrics.items()}
     finite |= {f"the state of the {name}": all_finite(part) for name, part in parts.items()}
     return after, {**seen, **metrics}, finite

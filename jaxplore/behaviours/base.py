@@ -12,11 +12,10 @@ import jax
 import jax.numpy as jnp
 
 from jaxplore import normalizer, replay
-from jaxplore.beliefs.base import Belief
 from jaxplore.dynamics import Normalizers
 from jaxplore.learners.base import Learner
 from jaxplore.replay import Replay
-from jaxplore.signals.base import Score
+from jaxplore.signals.base import Signal
 from jaxplore.types import Array, Key, Metrics, Transition, no_metrics
 
 DRAWN_AHEAD = 64
@@ -37,15 +36,8 @@ class Experience(NamedTuple):
     normalizers: Normalizers
     obs: Array
     """Where the real environment stands, `[O]`."""
-
-
-class Bonus(NamedTuple):
-    """An intrinsic reward that a behaviour itself gives, without a belief."""
-
-    score: Callable[[Any, Normalizers, Transition], Array]
-    """`score(state, normalizers, transitions [T, ...]) -> [T]`, of the behaviour's state."""
-    unit: str
-    """Of the score, for labels."""
+    own: Any = ()
+    """What the signal carries beside the belief, fixed for the round, too."""
 
 
 class Behaviour(NamedTuple):
@@ -61,8 +53,9 @@ class Behaviour(NamedTuple):
     """`act(key, actor, normalizers, obs [..., O]) -> action [..., A]`, for the real environment."""
     act_greedily: Callable[[Key, Any, Normalizers, Array], Array] | None = None
     """The same without exploring, for evaluation: the action that the behaviour holds for the best. None: `act`."""
-    bonus: Bonus | None = None
-    """The intrinsic reward where the behaviour has one of its own."""
+    score: Callable[[Any, Normalizers, Transition], Array] | None = None
+    """`score(state, normalizers, transitions [T, ...]) -> [T]`: the signal's score, where the behaviour holds what the
+    signal carries beside the belief, and says when it learns. None: the explorer does."""
     adopt: Callable[[Any, Any], Any] | None = None
     """`adopt(state, actor) -> state`: with the policy of another behaviour's `actor`, to learn on from. None: there is
     no policy that could be taken over and would stay."""
@@ -90,25 +83,42 @@ def renewed(key: Key, state: Any, init: Callable[[Key], Any], restart_every: int
     return jax.tree.map(lambda new, old: jnp.where(due, new, old), init(key), state)
 
 
-def label(belief: Belief, score: Score, experience: Experience) -> Replay[Transition]:
-    """The real data with the intrinsic reward that the round's models give it.
+def check_imaginable(signal: Signal) -> None:
+    """Raise unless it can be said of imagined transitions what they are worth.
+
+    Raises:
+        ValueError: names what fits.
+    """
+    allowed = "a signal with a belief that predicts, or a behaviour on real transitions"
+    if signal.score is None:
+        raise ValueError(
+            "the signal cannot be imagined: it is the environment's own reward, which only real transitions have. "
+            f"Allowed: {allowed}."
+        )
+    if signal.belief.predict is None:
+        raise ValueError(f"belief predicts nothing, so the signal cannot be imagined. Allowed: {allowed}.")
+
+
+def label(signal: Signal, experience: Experience) -> Replay[Transition]:
+    """The real data with the reward that the round's signal gives it.
 
     Args:
-        belief: it must predict.
-        score: the intrinsic reward.
+        signal: how interesting a transition is; of the environment's own reward the data are returned as they are.
         experience: models and data. Rows that the data do not hold get 0.
 
     Returns:
         The data, `reward` replaced.
     """
     data, normalizers = experience.data, experience.normalizers
+    if signal.score is None:
+        return data
     capacity = replay.capacity(data)
 
     def chunk(i: Array, rewards: Array) -> Array:
         place = i * LABEL_CHUNK + jnp.arange(LABEL_CHUNK)
         # The last chunk is filled up with rows already seen: a reward may compare rows, and empty ones are no data.
         rows = jax.tree.map(lambda leaf: leaf[place % jnp.maximum(data.size, 1)], data.rows)
-        given = score(*belief.judge(experience.models, normalizers, rows), normalizers)
+        given = signal.judge(experience.models, experience.own, normalizers, rows)
         return rewards.at[jnp.where(place < data.size, place, capacity)].set(given, mode="drop")
 
     num_chunks = (jnp.minimum(experience.num_data, capacity) + LABEL_CHUNK - 1) // LABEL_CHUNK
@@ -206,13 +216,17 @@ AS_THEY_ARE = RewardMoments(1.0, 0.0)
 """Rewards in their own units."""
 
 
-def reward_moments(data: Replay[Transition], normalize: bool, center: bool) -> RewardMoments:
-    """Of the rewards held the standard deviation, at least 1e-6, and the mean; 1 and 0 where they are not asked for."""
+def reward_moments(
+    data: Replay[Transition], normalize: bool, center: bool, std: Array | float = AS_THEY_ARE.std
+) -> RewardMoments:
+    """Of the rewards held the standard deviation, at least 1e-6, and the mean; `std` and 0 where they are not asked
+    for.
+    """
     if not normalize and not center:
-        return AS_THEY_ARE
+        return RewardMoments(std, AS_THEY_ARE.mean)
     held = jnp.arange(replay.capacity(data)) < data.size
     count = jnp.maximum(data.size, 1)
     rewards = jnp.where(held, data.rows.reward, 0.0)
     mean = jnp.sum(rewards) / count
-    std = jnp.maximum(jnp.sqrt(jnp.sum(jnp.where(held, rewards - mean, 0.0) ** 2) / count), 1e-6)
-    return RewardMoments(std if normalize else AS_THEY_ARE.std, mean if center else AS_THEY_ARE.mean)
+    own_std = jnp.maximum(jnp.sqrt(jnp.sum(jnp.where(held, rewards - mean, 0.0) ** 2) / count), 1e-6)
+    return RewardMoments(own_std if normalize else std, mean if center else AS_THEY_ARE.mean)

@@ -15,9 +15,8 @@ import optax
 from flax import struct
 
 from jaxplore import normalizer, replay, validate
-from jaxplore.behaviours.base import Behaviour, Experience
-from jaxplore.behaviours.rollout import World, rollout
-from jaxplore.beliefs.base import Belief
+from jaxplore.behaviours.base import Behaviour, Experience, check_imaginable
+from jaxplore.behaviours.rollout import World, rollout, world_of
 from jaxplore.dynamics import Normalizers
 from jaxplore.networks import (
     ACTIVATIONS,
@@ -28,7 +27,7 @@ from jaxplore.networks import (
     sample_tanh_gaussian,
     tanh_mean,
 )
-from jaxplore.signals.base import Score
+from jaxplore.signals.base import Signal
 from jaxplore.types import Array, Key, Metrics, Params, no_metrics
 from jaxplore.validate import Checks
 
@@ -98,8 +97,7 @@ class GradientPolicyState:
 class GradientPolicy(NamedTuple):
     """The fixed parts of the behaviour."""
 
-    belief: Belief
-    score: Score
+    signal: Signal
     policy: TanhGaussianPolicy
     optimizer: optax.GradientTransformation
     obs_size: int
@@ -133,8 +131,7 @@ def imagined_return(
         >>> policy = TanhGaussianPolicy((8,), 1)
         >>> params = policy.init(jax.random.key(2), jnp.zeros(2))["params"]
         >>> world = World(
-        ...     belief, models, dynamics.init_normalizers(2, 1),
-        ...     lambda prediction, delta, normalizers: rewards.variance(prediction))
+        ...     belief, models, dynamics.init_normalizers(2, 1), lambda seen: rewards.variance(seen.prediction))
         >>> config = GradientPolicyConfig(horizon=3)
         >>> gradient = jax.jit(jax.grad(lambda params: imagined_return(
         ...     jax.random.key(3), policy, params, world, jnp.zeros((16, 2)), config)[0]))
@@ -154,13 +151,13 @@ def imagined_return(
 
 
 def make_gradient_policy(
-    belief: Belief, score: Score, obs_size: int, action_size: int, config: GradientPolicyConfig | None = None
+    signal: Signal, obs_size: int, action_size: int, config: GradientPolicyConfig | None = None
 ) -> Behaviour:
     """Climb the intrinsic reward's own gradient.
 
     Args:
-        belief: whose models are differentiated; it must predict changes, not probabilities.
-        score: the intrinsic reward, differentiable in what the models predict.
+        signal: what is sought, differentiable in what the models predict or in where that leads; its belief's models
+            are differentiated and must predict changes, not probabilities.
         obs_size: `O`.
         action_size: `A`.
         config: how long, how far ahead, and how fast.
@@ -170,31 +167,30 @@ def make_gradient_policy(
         `imagined_reward_p95`, `saturation` (mean absolute action of the squashed mean) and `gradient` (its norm).
 
     Raises:
-        ValueError: a size below 1; the belief predicts nothing, or which of finitely many states comes next.
+        ValueError: a size below 1; the signal cannot be imagined, or its belief predicts which of finitely many states
+            comes next.
 
     Example:
         >>> import jax, jax.numpy as jnp
-        >>> from jaxplore import beliefs, dynamics, rewards
+        >>> from jaxplore import beliefs, dynamics, rewards, signals
         >>> belief = beliefs.make_generator_belief(2, 1, dynamics.DynamicsConfig(hidden=(8,)))
+        >>> reward = signals.Reward(lambda prediction, delta, normalizers: rewards.variance(prediction), "squared")
         >>> behaviour = make_gradient_policy(
-        ...     belief, lambda prediction, delta, normalizers: rewards.variance(prediction), 2, 1,
-        ...     GradientPolicyConfig(hidden=(8,)))
+        ...     signals.make_belief_signal(belief, reward), 2, 1, GradientPolicyConfig(hidden=(8,)))
         >>> actor = behaviour.actor(behaviour.init(jax.random.key(0)))
         >>> behaviour.act(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
         (5, 1)
     """
     validate.sizes(obs_size=obs_size, action_size=action_size)
     config = config or GradientPolicyConfig()
-    if belief.predict is None or belief.encoding.is_probability:
-        raise ValueError(
-            "the belief's predictions cannot be differentiated. Allowed: a belief with `predict` and "
-            "DynamicsConfig.target='delta'."
-        )
+    check_imaginable(signal)
+    if signal.belief.encoding.is_probability:
+        raise ValueError("the belief's predictions cannot be differentiated. Allowed: DynamicsConfig.target='delta'.")
     policy = TanhGaussianPolicy(
         config.hidden, action_size, config.activation, config.init, (config.log_std_min, config.log_std_max)
     )
     optimizer = optax.chain(optax.clip(config.grad_clip), optax.adam(config.lr))
-    parts = GradientPolicy(belief, score, policy, optimizer, obs_size, config)
+    parts = GradientPolicy(signal, policy, optimizer, obs_size, config)
     act_greedily = functools.partial(act_by_mean, parts)
     return Behaviour(
         init=functools.partial(init, parts),
@@ -216,7 +212,7 @@ def loss(
 ) -> tuple[Array, Metrics]:
     """The imagined return, negative and scaled, with the penalty on actions that saturate; and metrics."""
     config = parts.config
-    world = World(parts.belief, experience.models, experience.normalizers, parts.score)
+    world = world_of(parts.signal, experience)
     expected, (rewards, gaussian) = imagined_return(key, parts.policy, params, world, start, config)
     scale = jnp.maximum(jnp.mean(jnp.abs(jax.lax.stop_gradient(rewards))), 1e-6) if config.normalize_reward else 1.0
     metrics = {

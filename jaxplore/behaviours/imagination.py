@@ -12,6 +12,7 @@ from jaxplore import normalizer, replay, validate
 from jaxplore.behaviours.base import (
     Behaviour,
     Experience,
+    check_imaginable,
     label,
     lesson_of,
     make_act,
@@ -20,12 +21,11 @@ from jaxplore.behaviours.base import (
     reward_moments,
     train,
 )
-from jaxplore.behaviours.rollout import Mover, World, rollout
+from jaxplore.behaviours.rollout import Mover, rollout, world_of
 from jaxplore.behaviours.uniform import uniform_actions
-from jaxplore.beliefs.base import Belief
 from jaxplore.learners.base import Learner
 from jaxplore.replay import Replay
-from jaxplore.signals.base import Score
+from jaxplore.signals.base import Signal
 from jaxplore.types import Array, Key, Metrics, Transition
 from jaxplore.validate import Checks
 
@@ -101,8 +101,7 @@ class ImaginationState:
 class Imagination(NamedTuple):
     """The fixed parts of the behaviour."""
 
-    belief: Belief
-    score: Score
+    signal: Signal
     learner: Learner
     example: Transition
     """One transition of zeros, in the environment's shapes."""
@@ -112,8 +111,7 @@ class Imagination(NamedTuple):
 
 
 def make_imagination(
-    belief: Belief,
-    score: Score,
+    signal: Signal,
     learner: Learner,
     obs_size: int,
     action_size: int,
@@ -123,8 +121,7 @@ def make_imagination(
     """Train a learner in rollouts imagined by the belief's models (Algorithm 1, lines 7-9).
 
     Args:
-        belief: whose models imagine; it must predict.
-        score: the intrinsic reward.
+        signal: what is sought, with a belief whose models imagine.
         learner: such as `make_sac` gives, or where actions are discrete `make_ddqn`; it sees normalised observations.
         obs_size: `O`.
         action_size: `A`.
@@ -137,26 +134,26 @@ def make_imagination(
         transitions that were not finite, and dropped).
 
     Raises:
-        ValueError: the belief does not predict, or a size is below 1.
+        ValueError: the signal cannot be imagined, or a size is below 1.
 
     Example:
         >>> import jax, jax.numpy as jnp
-        >>> from jaxplore import beliefs, dynamics, learners, rewards
+        >>> from jaxplore import beliefs, dynamics, learners, rewards, signals
         >>> belief = beliefs.make_generator_belief(2, 1, dynamics.DynamicsConfig(hidden=(8,)))
         >>> sac = learners.make_sac(2, 1, learners.SACConfig(hidden=(8,)))
+        >>> reward = signals.Reward(lambda prediction, delta, normalizers: rewards.variance(prediction), "squared")
         >>> behaviour = make_imagination(
-        ...     belief, lambda prediction, delta, normalizers: rewards.variance(prediction), sac, 2, 1,
+        ...     signals.make_belief_signal(belief, reward), sac, 2, 1,
         ...     ImaginationConfig(num_actors=16, horizon=5, replay_capacity=4000))
         >>> actor = behaviour.actor(jax.jit(behaviour.init)(jax.random.key(0)))
         >>> behaviour.act(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
         (5, 1)
     """
-    if belief.predict is None:
-        raise ValueError("belief predicts nothing, so nothing can be imagined. Allowed: a belief with `predict`.")
+    check_imaginable(signal)
     validate.sizes(obs_size=obs_size, action_size=action_size)
     flag = jnp.zeros((), bool)
     example = Transition(jnp.zeros(obs_size), jnp.zeros(action_size), jnp.zeros(()), jnp.zeros(obs_size), flag, flag)
-    parts = Imagination(belief, score, learner, example, config, discrete)
+    parts = Imagination(signal, learner, example, config, discrete)
     return Behaviour(
         init=functools.partial(init, parts),
         improve=functools.partial(improve, parts),
@@ -186,14 +183,15 @@ def improve(
     state = renewed(init_key, state, functools.partial(init, parts), config.restart_every)
     before = state.imagined if config.keep_imagined else replay.cleared(state.imagined)
     needs_real = config.real_updates > 0 or config.real_fraction > 0
-    real = label(parts.belief, parts.score, experience) if needs_real else experience.data
+    real = label(parts.signal, experience) if needs_real else experience.data
+    std = parts.signal.std(experience.own)
     obs_size, action_size = parts.example.obs.shape[0], parts.example.action.shape[0]
     learner_state, metrics = state.learner, no_learner_metrics(learner, obs_size, action_size)
     real_updates = config.real_updates
     if config.real_fraction == 1.0:
         real_updates += max(config.num_rollouts - config.num_random_rollouts, 0) * config.updates_per_rollout
     if real_updates > 0:
-        moments = reward_moments(real, config.normalize_reward, config.center_reward)
+        moments = reward_moments(real, config.normalize_reward, config.center_reward, std)
         lesson = lesson_of([(real, learner.batch_size)], normalizers, moments)
         learner_state, metrics = train(learner, real_key, learner_state, lesson, real_updates, metrics)
     if config.real_fraction == 1.0:
@@ -208,7 +206,7 @@ def improve(
         imagined = replay.add(imagined, rows, finite)
         num_real = round(config.real_fraction * learner.batch_size)
         parts_of_batch = [(real, num_real), (imagined, learner.batch_size - num_real)]
-        moments = reward_moments(imagined, config.normalize_reward, config.center_reward)
+        moments = reward_moments(imagined, config.normalize_reward, config.center_reward, std)
         lesson = lesson_of(parts_of_batch, normalizers, moments)
         num_updates = config.updates_per_rollout
         learner_state, metrics = train(
@@ -241,7 +239,7 @@ def imagine(
         drawn = parts.learner.act(key, actor, normalizer.normalize(normalizers.obs, obs))
         return jnp.where(is_random, uniform_actions(key, obs, drawn.shape[-1], parts.discrete), drawn)
 
-    world = World(parts.belief, experience.models, normalizers, parts.score)
+    world = world_of(parts.signal, experience)
     start = starts(start_key, experience, config.num_actors, config.current_fraction)
     rows = rollout(rollout_key, act, world, start, config.horizon, config.mover, config.bound)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), rows)

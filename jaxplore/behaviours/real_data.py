@@ -1,17 +1,15 @@
-"""Behaviour on real transitions alone: re-labelled with an intrinsic reward, or with the task's own."""
+"""Behaviour on real transitions alone, with the reward that a signal gives them now, or with the task's own."""
 
 import functools
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxplore import validate
+from jaxplore import replay, validate
 from jaxplore.behaviours.base import (
-    AS_THEY_ARE,
     Behaviour,
     Experience,
     label,
@@ -22,11 +20,10 @@ from jaxplore.behaviours.base import (
     reward_moments,
     train,
 )
-from jaxplore.beliefs.base import Belief
 from jaxplore.learners.base import Learner
-from jaxplore.replay import Replay
-from jaxplore.signals.base import Score
-from jaxplore.types import Array, Key, Metrics, Transition
+from jaxplore.signals.base import Signal
+from jaxplore.signals.task import TASK
+from jaxplore.types import Array, Key, Metrics
 from jaxplore.validate import Checks
 
 
@@ -55,7 +52,7 @@ class ReactiveConfig:
 
 @struct.dataclass
 class ReactiveState:
-    """What a policy trained on re-labelled real transitions carries."""
+    """What a policy trained on real transitions carries, where it lives for some rounds."""
 
     learner: Any
     age: Array
@@ -65,80 +62,75 @@ class ReactiveState:
 class Reactive(NamedTuple):
     """The fixed parts of the behaviour."""
 
-    relabel: Callable[[Experience], Replay[Transition]]
-    """`relabel(experience) -> data`, `reward` replaced."""
+    signal: Signal
     learner: Learner
     sizes: tuple[int, int]
     """`O` and `A`."""
     config: ReactiveConfig
+    normalize_obs: bool
+    std_draws: int
 
 
 def make_reactive(
-    belief: Belief,
-    score: Score,
+    signal: Signal,
     learner: Learner,
     obs_size: int,
     action_size: int,
     config: ReactiveConfig | None = None,
+    *,
+    lasting: bool = False,
+    normalize_obs: bool = True,
+    std_draws: int = 0,
 ) -> Behaviour:
-    """Train a learner on real transitions alone, with the intrinsic reward that the round's models give them.
+    """Train a learner on real transitions alone, with the reward that the round's signal gives them.
 
     The reactive mode of nnaisense/max: novelty is looked for where the agent has been, nothing is imagined. As models
     have just been fitted to the same transitions, an error is small where the fit is good, not only where nothing is
     new.
 
     Args:
-        belief: whose models label the data; it must predict.
-        score: the intrinsic reward.
-        learner: such as `make_sac` gives; it sees normalised observations.
+        signal: how interesting a transition is.
+        learner: such as `make_sac` gives.
         obs_size: `O`.
         action_size: `A`.
         config: how much of everything.
+        lasting: whether the policy lives as long as the run, each round going on where the last one stopped, whatever
+            `config.restart_every` is.
+        normalize_obs: whether the learner sees observations less their mean and over their standard deviation.
+        std_draws: transitions, drawn anew in each round, over which `config.normalize_reward` takes the standard
+            deviation. 0: all.
 
     Returns:
         A `Behaviour`. The metrics are the learner's, from the last update.
 
     Raises:
-        ValueError: the belief does not predict, or a size is below 1.
+        FieldError: a size is below 1.
 
     Example:
         >>> import jax, jax.numpy as jnp
-        >>> from jaxplore import beliefs, dynamics, learners, rewards
+        >>> from jaxplore import beliefs, dynamics, learners, rewards, signals
         >>> belief = beliefs.make_ensemble_belief(2, 1, 5, dynamics_config=dynamics.DynamicsConfig(hidden=(8,)))
+        >>> error = signals.Reward(
+        ...     lambda prediction, delta, normalizers: rewards.prediction_error(prediction, delta), "squared")
         >>> sac = learners.make_sac(2, 1, learners.SACConfig(hidden=(8,)))
-        >>> behaviour = make_reactive(
-        ...     belief, lambda prediction, delta, normalizers: rewards.prediction_error(prediction, delta), sac, 2, 1)
+        >>> behaviour = make_reactive(signals.make_belief_signal(belief, error), sac, 2, 1)
         >>> actor = behaviour.actor(jax.jit(behaviour.init)(jax.random.key(0)))
         >>> behaviour.act(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
         (5, 1)
     """
-    if belief.predict is None:
-        raise ValueError("belief predicts nothing, so nothing can be labelled. Allowed: a belief with `predict`.")
-    relabel = functools.partial(label, belief, score)
-    return make_relabelled(relabel, learner, obs_size, action_size, config)
-
-
-def make_relabelled(
-    relabel: Callable[[Experience], Replay[Transition]],
-    learner: Learner,
-    obs_size: int,
-    action_size: int,
-    config: ReactiveConfig | None = None,
-) -> Behaviour:
-    """`make_reactive` with a reward of any kind: `relabel(experience) -> data`, the real data with `reward` replaced.
-
-    Raises:
-        FieldError: a size is below 1.
-    """
     validate.sizes(obs_size=obs_size, action_size=action_size)
     config = config or ReactiveConfig()
-    parts = Reactive(relabel, learner, (obs_size, action_size), config)
+    parts = Reactive(signal, learner, (obs_size, action_size), config, normalize_obs, std_draws)
+    act, act_greedily = (make_act(learner, greedily, normalize_obs) for greedily in (config.act_greedily, True))
+    if lasting:
+        improve = functools.partial(train_on_real_data, parts)
+        return Behaviour(learner.init, improve, learner.actor, act, act_greedily, adopt=learner.adopt)
     return Behaviour(
         init=functools.partial(init_reactive, parts),
         improve=functools.partial(improve_reactive, parts),
         actor=lambda state: learner.actor(state.learner),
-        act=make_act(learner, config.act_greedily),
-        act_greedily=make_act(learner, True),
+        act=act,
+        act_greedily=act_greedily,
     )
 
 
@@ -150,21 +142,33 @@ def init_reactive(parts: Reactive, key: Key) -> ReactiveState:
 def improve_reactive(
     parts: Reactive, key: Key, state: ReactiveState, experience: Experience
 ) -> tuple[ReactiveState, Metrics]:
-    """One round: all real data get their reward, and the policy its updates on them."""
-    learner, config = parts.learner, parts.config
+    """One round of a policy that lives for some of them."""
     init_key, train_key = jax.random.split(key)
-    state = renewed(init_key, state, functools.partial(init_reactive, parts), config.restart_every)
-    real = parts.relabel(experience)
-    moments = reward_moments(real, config.normalize_reward, config.center_reward)
-    lesson = lesson_of([(real, learner.batch_size)], experience.normalizers, moments)
-    nothing = no_learner_metrics(learner, *parts.sizes)
-    learner_state, metrics = train(learner, train_key, state.learner, lesson, config.updates, nothing)
+    state = renewed(init_key, state, functools.partial(init_reactive, parts), parts.config.restart_every)
+    learner_state, metrics = train_on_real_data(parts, train_key, state.learner, experience)
     return ReactiveState(learner_state, state.age + 1), metrics
+
+
+def train_on_real_data(parts: Reactive, key: Key, state: Any, experience: Experience) -> tuple[Any, Metrics]:
+    """One round: all real data get their reward, and the learner its updates on them."""
+    learner, config = parts.learner, parts.config
+    real = label(parts.signal, experience)
+    measured = real
+    if config.normalize_reward and parts.std_draws:
+        std_key, key = jax.random.split(key)
+        drawn = replay.sample(std_key, real, parts.std_draws)
+        measured = replace(real, rows=drawn, size=jnp.full((), parts.std_draws))
+    std = parts.signal.std(experience.own)
+    moments = reward_moments(measured, config.normalize_reward, config.center_reward, std)
+    normalizers = experience.normalizers if parts.normalize_obs else None
+    lesson = lesson_of([(real, learner.batch_size)], normalizers, moments)
+    nothing = no_learner_metrics(learner, *parts.sizes)
+    return train(learner, key, state, lesson, config.updates, nothing)
 
 
 @dataclass(frozen=True)
 class ModelFreeConfig:
-    """How a learner is trained on real transitions alone, with the environment's own reward."""
+    """How a learner that lives as long as the run is trained on real transitions alone."""
 
     updates_per_round: int = 25
     """Updates after each round. 25: one for each step of a round of 25."""
@@ -179,18 +183,20 @@ class ModelFreeConfig:
 
 
 def make_model_free(
-    learner: Learner, obs_size: int, action_size: int, config: ModelFreeConfig | None = None
+    learner: Learner,
+    obs_size: int,
+    action_size: int,
+    config: ModelFreeConfig | None = None,
+    signal: Signal = TASK,
 ) -> Behaviour:
-    """Train a learner on the real transitions and the environment's own reward: no belief, no intrinsic reward.
-
-    The learner lives as long as the run; each round continues where the last one stopped, on batches drawn from all
-    real data.
+    """Train a learner that lives as long as the run on real transitions: `make_reactive` of a policy that lasts.
 
     Args:
         learner: such as `make_ddqn` or `make_sac` gives.
         obs_size: `O`.
         action_size: `A`.
         config: how much of everything. `normalize_obs` is done as it says, whatever the observations are.
+        signal: how interesting a transition is. By default what the environment's own reward says.
 
     Returns:
         A `Behaviour`. The metrics are the learner's, from the last update.
@@ -207,15 +213,7 @@ def make_model_free(
         >>> behaviour.act_greedily(jax.random.key(1), actor, dynamics.init_normalizers(4, 2), jnp.eye(4)).shape
         (4, 2)
     """
-    validate.sizes(obs_size=obs_size, action_size=action_size)
     config = config or ModelFreeConfig()
-
-    def improve(key: Key, state: Any, experience: Experience) -> tuple[Any, Metrics]:
-        normalizers = experience.normalizers if config.normalize_obs else None
-        lesson = lesson_of([(experience.data, learner.batch_size)], normalizers, AS_THEY_ARE)
-        nothing = no_learner_metrics(learner, obs_size, action_size)
-        return train(learner, key, state, lesson, config.updates_per_round, nothing)
-
-    act = make_act(learner, config.act_greedily, config.normalize_obs)
-    act_greedily = make_act(learner, True, config.normalize_obs)
-    return Behaviour(learner.init, improve, learner.actor, act, act_greedily, adopt=learner.adopt)
+    reactive = ReactiveConfig(config.updates_per_round, act_greedily=config.act_greedily)
+    options = {"lasting": True, "normalize_obs": config.normalize_obs}
+    return make_reactive(signal, learner, obs_size, action_size, reactive, **options)

@@ -1,5 +1,6 @@
 """Rollouts of a policy in sampled models: all m models, all actors, the whole horizon in one program."""
 
+import functools
 from collections.abc import Callable
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
@@ -7,9 +8,10 @@ import jax
 import jax.numpy as jnp
 
 from jaxplore import normalizer, validate
+from jaxplore.behaviours.base import Experience
 from jaxplore.beliefs.base import Belief
 from jaxplore.dynamics import Normalizers
-from jaxplore.signals.base import Score
+from jaxplore.signals.base import Seen, Signal
 from jaxplore.types import Array, Key, Transition
 from jaxplore.validate import FieldError
 
@@ -26,8 +28,15 @@ class World(NamedTuple):
     """As the belief samples them, with a leading axis `M`."""
     normalizers: Normalizers
     """Units of the models."""
-    score: Score
-    """The intrinsic reward of each imagined step."""
+    score: Callable[[Seen], Array]
+    """`score(seen) -> [N]`: the intrinsic reward of each imagined step."""
+
+
+def world_of(signal: Signal, experience: Experience) -> World:
+    """What a round's models and signal make of the world."""
+    assert signal.score is not None
+    score = functools.partial(signal.score, experience.own)
+    return World(signal.belief, experience.models, experience.normalizers, score)
 
 
 def rollout(
@@ -67,8 +76,7 @@ def rollout(
         >>> belief = beliefs.make_generator_belief(2, 1, dynamics.DynamicsConfig(hidden=(8,)))
         >>> models = belief.sample(jax.random.key(0), belief.init(jax.random.key(1)), 4)
         >>> world = World(
-        ...     belief, models, dynamics.init_normalizers(2, 1),
-        ...     lambda prediction, delta, normalizers: rewards.variance(prediction))
+        ...     belief, models, dynamics.init_normalizers(2, 1), lambda seen: rewards.variance(seen.prediction))
         >>> imagined = rollout(
         ...     jax.random.key(2), lambda key, obs: jax.random.uniform(key, (obs.shape[0], 1)), world,
         ...     jnp.zeros((16, 2)), horizon=5)
@@ -105,6 +113,7 @@ def rollout(
             seen = normalizer.normalize(normalizers.obs, next_obs, limit=None)
             next_obs = normalizer.denormalize(normalizers.obs, jnp.clip(seen, -bound, bound))
         never = jnp.zeros(num_actors, bool)
-        return next_obs, Transition(obs, action, score(prediction, delta, normalizers), next_obs, never, never)
+        row = Transition(obs, action, jnp.zeros(num_actors), next_obs, never, never)
+        return next_obs, row._replace(reward=score(Seen(row, prediction, delta, normalizers)))
 
     return jax.lax.scan(step, start, jax.random.split(scan_key, horizon))[1]

@@ -13,12 +13,12 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxplore import validate
-from jaxplore.behaviours.base import Behaviour, Experience
+from jaxplore.behaviours.base import Behaviour, Experience, check_imaginable
 from jaxplore.behaviours.mcts import MCTSConfig, Tables, make_mcts
-from jaxplore.beliefs.base import Belief
+from jaxplore.behaviours.rollout import world_of
 from jaxplore.dynamics import Normalizers
-from jaxplore.signals.base import Score
-from jaxplore.types import Array, Key, Metrics
+from jaxplore.signals.base import Seen, Signal
+from jaxplore.types import Array, Key, Metrics, Transition
 from jaxplore.validate import FieldError
 
 DRAWS_PER_MODEL = 16
@@ -38,8 +38,7 @@ class PlanningState:
 class TreeSearch(NamedTuple):
     """The fixed parts of the behaviour."""
 
-    belief: Belief
-    score: Score
+    signal: Signal
     plan: Callable[..., Any]
     """`jaxplore.behaviours.mcts.MCTS.plan`."""
     num_states: int
@@ -50,18 +49,15 @@ class TreeSearch(NamedTuple):
     @property
     def num_tables(self) -> int:
         """Models that the search chooses from."""
-        return self.belief.num_models * (DRAWS_PER_MODEL if self.samples else 1)
+        return self.signal.belief.num_models * (DRAWS_PER_MODEL if self.samples else 1)
 
 
-def make_tree_search(
-    belief: Belief, score: Score, num_states: int, num_actions: int, config: MCTSConfig | None = None
-) -> Behaviour:
+def make_tree_search(signal: Signal, num_states: int, num_actions: int, config: MCTSConfig | None = None) -> Behaviour:
     """Plan every action by tree search (`jaxplore.behaviours.mcts`), and forget the tree.
 
     Args:
-        belief: whose models are searched; it must predict.
-        score: the intrinsic reward, as a function of state and action. The change that it gets is the models'
-            mean prediction.
+        signal: what is sought, as a function of state and action, with a belief whose models are searched. The change
+            that it gets is the models' mean prediction.
         num_states: `O`; observations are one-hot.
         num_actions: `A`; so are actions.
         config: how the search goes.
@@ -71,31 +67,30 @@ def make_tree_search(
         `utility` and `utility_max`, and `agreement`, the share where all models go to the same state.
 
     Raises:
-        ValueError: a size is below 1, the belief does not predict, `config` does not fit the number of actions, or next
-            states are to be sampled and the belief does not predict probabilities.
+        ValueError: a size is below 1, the signal cannot be imagined, `config` does not fit the number of actions, or
+            next states are to be sampled and the belief does not predict probabilities.
 
     Example:
         >>> import jax, jax.numpy as jnp
-        >>> from jaxplore import beliefs, dynamics, rewards
+        >>> from jaxplore import beliefs, dynamics, rewards, signals
         >>> belief = beliefs.make_generator_belief(6, 2, dynamics.DynamicsConfig(hidden=(8,), target="one_hot"))
-        >>> behaviour = make_tree_search(
-        ...     belief, lambda prediction, delta, normalizers: rewards.variance(prediction), 6, 2)
+        >>> reward = signals.Reward(lambda prediction, delta, normalizers: rewards.variance(prediction), "squared")
+        >>> behaviour = make_tree_search(signals.make_belief_signal(belief, reward), 6, 2)
         >>> actor = behaviour.actor(behaviour.init(jax.random.key(0)))
         >>> obs = jax.nn.one_hot(3, 6)
         >>> int(behaviour.act(jax.random.key(1), actor, dynamics.init_normalizers(6, 2), obs).sum())
         1
     """
-    if belief.predict is None:
-        raise ValueError("belief predicts nothing, so nothing can be searched. Allowed: a belief with `predict`.")
+    check_imaginable(signal)
     validate.sizes(num_states=num_states, num_actions=num_actions)
     config = config or MCTSConfig()
     samples = config.model_step == "sample"
-    if samples and not belief.encoding.is_probability:
+    if samples and not signal.belief.encoding.is_probability:
         raise FieldError(
             "model_step", "sample", "'arg_max', or DynamicsConfig.target='one_hot'", "needs probabilities", "MCTSConfig"
         )
     plan = make_mcts(num_actions, config).plan
-    parts = TreeSearch(belief, score, plan, num_states, num_actions, samples)
+    parts = TreeSearch(signal, plan, num_states, num_actions, samples)
     return Behaviour(
         init=functools.partial(init, parts),
         improve=functools.partial(improve, parts),
@@ -112,12 +107,15 @@ def init(parts: TreeSearch, key: Key) -> PlanningState:
 
 def improve(parts: TreeSearch, key: Key, state: PlanningState, experience: Experience) -> tuple[PlanningState, Metrics]:
     """Ask the round's models about all states and actions."""
-    belief, normalizers = parts.belief, experience.normalizers
+    belief, models, normalizers, score = world_of(parts.signal, experience)
     pairs = (parts.num_states, parts.num_actions)
     obs = jnp.repeat(jnp.eye(parts.num_states), parts.num_actions, axis=0)
     action = jnp.tile(jnp.eye(parts.num_actions), (parts.num_states, 1))
-    prediction = belief.imagine(experience.models, normalizers, obs, action)
-    utility = parts.score(prediction, jnp.mean(prediction.mean, axis=0), normalizers)
+    prediction = belief.imagine(models, normalizers, obs, action)
+    expected, never = jnp.mean(prediction.mean, axis=0), jnp.zeros(len(obs), bool)
+    next_obs = belief.encoding.next_obs(normalizers, obs, expected)
+    rows = Transition(obs, action, jnp.zeros(len(obs)), next_obs, never, never)
+    utility = score(Seen(rows, prediction, expected, normalizers))
     successors = jax.vmap(belief.encoding.next_obs, in_axes=(None, None, 0))(normalizers, obs, prediction.mean)
     likely = jnp.argmax(successors, -1)
     next_state = likely

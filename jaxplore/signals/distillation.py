@@ -1,10 +1,10 @@
 """Random network distillation: what a network has not learned to imitate has not been seen.
 
 Burda et al. (2019), arXiv 1810.12894, with small networks for vectors instead of theirs for pictures. A predictor
-learns to say of an observation what a fixed random network says; its error is the bonus. What is done with the bonus
-is in `jaxplore.behaviours.distillation`.
+learns to say of an observation what a fixed random network says; its error is the bonus.
 """
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -14,10 +14,14 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from jaxplore import normalizer, validate
+from jaxplore import normalizer, replay, validate
+from jaxplore.beliefs.base import Belief, make_no_belief
+from jaxplore.dynamics import Normalizers
 from jaxplore.networks import ACTIVATIONS, MLP, apply
 from jaxplore.normalizer import Normalizer
-from jaxplore.types import Array, Key, Params
+from jaxplore.replay import Replay
+from jaxplore.signals.base import Learning, Seen, Signal
+from jaxplore.types import Array, Key, Metrics, Params, Transition
 from jaxplore.validate import Checks
 
 UNIT = "squared distillation error"
@@ -168,3 +172,92 @@ def update_scale(state: RewardScale, rewards: Array, valid: Array, discount: flo
 
     running, sums = jax.lax.scan(step, state.running, (rewards, valid))
     return RewardScale(running, normalizer.update(state.sums, sums[:, None], valid.astype(jnp.float32)))
+
+
+@struct.dataclass
+class Distilled:
+    """What distillation carries as a signal."""
+
+    rnd: RNDState
+    scale: RewardScale
+    position: Array
+    """Of the replay, up to where transitions have been taken in, int32; -1 before the first round."""
+
+
+def newest(data: Replay[Transition], position: Array, count: int) -> tuple[Transition, Array, Array]:
+    """The real transitions since the replay's `position`, at most `count` of them.
+
+    Returns:
+        `(transitions [count, ...], valid [count], the replay's position now)`. A negative `position` stands for a
+        replay that was never looked at: nothing is new.
+    """
+    capacity = replay.capacity(data)
+    new = jnp.where(position < 0, 0, (data.position - position) % capacity)
+    index = (position + jnp.arange(count)) % capacity
+    return jax.tree.map(lambda leaf: leaf[index], data.rows), jnp.arange(count) < new, data.position
+
+
+def make_distillation(
+    obs_size: int, steps_per_round: int, config: RNDConfig | None = None, belief: Belief | None = None
+) -> Signal:
+    """Random network distillation as a signal: a transition is worth the error of where it leads.
+
+    Each round learns from the transitions that it brought; those at the start, before the first round, only fill the
+    statistics that observations are normalised with.
+
+    Args:
+        obs_size: `O`.
+        steps_per_round: most transitions that a round brings.
+        config: Burda et al.'s settings by default.
+        belief: whose models imagine where a policy would lead; the score is not read off them. None: nothing can be
+            imagined.
+
+    Returns:
+        A `Signal`. The metric of `fit` is `rnd_error`, of the last distillation step.
+
+    Raises:
+        FieldError: `obs_size` below 1.
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> from jaxplore import dynamics
+        >>> signal = make_distillation(2, steps_per_round=25, config=RNDConfig(hidden=(8,), features=8))
+        >>> own, obs, flag = signal.init(jax.random.key(0)), jnp.ones((5, 2)), jnp.zeros(5, bool)
+        >>> rows = Transition(obs, jnp.zeros((5, 1)), jnp.zeros(5), obs, flag, flag)
+        >>> signal.score(own, Seen(rows, None, None, dynamics.init_normalizers(2, 1))).shape
+        (5,)
+    """
+    config = config or RNDConfig()
+    rnd = make_rnd(obs_size, config)
+
+    def init(key: Key) -> Distilled:
+        return Distilled(rnd.init(key), init_scale(), jnp.full((), -1, jnp.int32))
+
+    def see(seen: Seen) -> Array:
+        return normalizer.normalize(seen.normalizers.obs, seen.transitions.next_obs)
+
+    def score(own: Distilled, seen: Seen) -> Array:
+        return rnd.error(own.rnd, see(seen))
+
+    def measure(own: Distilled, seen: Seen, valid: Array) -> tuple[Distilled, Array]:
+        bonus = score(own, seen)
+        return dataclasses.replace(own, scale=update_scale(own.scale, bonus, valid, config.discount)), bonus
+
+    def learn(own: Distilled, seen: Seen, weights: Array) -> tuple[Distilled, Array]:
+        distilled, error = rnd.update(own.rnd, see(seen), weights)
+        return dataclasses.replace(own, rnd=distilled), error
+
+    def fit(own: Distilled, data: Replay[Transition], normalizers: Normalizers) -> tuple[Distilled, Metrics]:
+        rows, valid, position = newest(data, own.position, steps_per_round)
+        seen = Seen(rows, None, None, normalizers)
+        own, _ = measure(own, seen, valid)
+
+        def distil(i: Array, carry: tuple[Distilled, Array]) -> tuple[Distilled, Array]:
+            return learn(carry[0], seen, valid.astype(jnp.float32))
+
+        own, error = jax.lax.fori_loop(0, config.epochs, distil, (own, jnp.zeros(())))
+        return dataclasses.replace(own, position=position), {"rnd_error": error}
+
+    return Signal(
+        score, UNIT, belief or make_no_belief(), init, fit, lambda own: own.scale.std, Learning(measure, learn)
+    )

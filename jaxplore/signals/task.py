@@ -1,14 +1,6 @@
-"""The task's own reward: nothing is read off a belief."""
+"""The environment's own reward, or none at all: nothing is learned to tell how interesting a transition is."""
 
-from jaxplore.dynamics import Normalizers, Prediction
-from jaxplore.signals.base import Reward
-from jaxplore.types import Array
+from jaxplore.signals.base import Signal
 
-
-def no_score(prediction: Prediction, delta: Array, normalizers: Normalizers) -> Array:
-    """Zero for each transition, `[N]`."""
-    return 0.0 * delta[..., 0]
-
-
-NO_REWARD = Reward(no_score, "no intrinsic reward")
+TASK = Signal(score=None, unit=None)
 """Of methods that learn from the environment's reward, or from nothing."""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from envs import ant_maze
-from jaxplore import METHODS, Replay, Transition
+from jaxplore import METHODS, Replay, Seen, Transition, dynamics
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +34,8 @@ def test_rarity_counts_the_rows_held(oracles):
     next_obs = at((0.1, 0.1), (0.2, 0.4), (0.4, 0.2), (4.0, 4.0), (0.1, 0.1))
     num, flag = len(next_obs), jnp.zeros(5, bool)
     rows = Transition(jnp.zeros_like(next_obs), jnp.zeros((num, 8)), jnp.zeros(num), next_obs, flag, flag)
-    reward = oracles.rarity(Replay(rows, jnp.int32(4), jnp.int32(4)))
+    visits = oracles.visits(Replay(rows, jnp.int32(4), jnp.int32(4)))
+    reward = oracles.rarity(visits, Seen(rows, None, None, dynamics.init_normalizers(next_obs.shape[1], 8)))
     np.testing.assert_allclose(reward[:4], [3**-0.5] * 3 + [1.0], rtol=1e-6)
 
 

@@ -13,7 +13,7 @@ from envs.base import Environment, EnvState
 from experiments.runs.config import RunConfig
 from experiments.training import build, placement, programs
 from experiments.training.programs import Programs, make_programs
-from jaxplore import methods, parts
+from jaxplore import methods
 from jaxplore.methods import Method, get_method
 from jaxplore.types import Array, Transition
 from tests.experiments import tiny
@@ -82,7 +82,7 @@ def main(name: str, num_devices: str) -> dict[str, Any]:
     """
     method, count = get_method(name.removesuffix(" belief")), int(num_devices)
     if name.endswith(" belief"):
-        method = Method("belief", parts.generator_belief, method.reward, methods.uniform_actions)
+        method = Method("belief", method.signal, methods.uniform_actions)
     spread = make(method, count, 0, count)
     state = spread.init()
     actors = spread.actors(state.explorer, False)

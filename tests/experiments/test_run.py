@@ -26,7 +26,7 @@ from experiments.runs.presets import preset_config
 from experiments.runs.spec import RunSpec, from_json, to_json
 from experiments.runs.status import Status
 from experiments.training import loop, record
-from jaxplore import beliefs, methods
+from jaxplore import TASK, beliefs, methods
 from jaxplore.methods import Method
 from tests.experiments.tiny import CELLS, ROOT, STEPS, TINY, assert_same_run, leaves, make_point, rows
 
@@ -514,7 +514,7 @@ def fragile(monkeypatch: pytest.MonkeyPatch):
     """`fragile(breaks, *seeds)`: a method whose numbers break at step 50, in those seeds of a run of two."""
 
     def make(breaks: str, *seeds: int) -> None:
-        def belief(sizes, config):
+        def signal(sizes, config):
             def update(key, state, data, normalizers):
                 bad = jnp.where((data.size >= 50) & state["breaks"], jnp.inf, 0.0)
                 report = {"loss": 1.0 + (bad if breaks == "metric" else 0.0)}
@@ -523,9 +523,10 @@ def fragile(monkeypatch: pytest.MonkeyPatch):
             def init(key):
                 return {"value": jnp.zeros(()), "breaks": jnp.zeros((), bool)}
 
-            return beliefs.Belief(init, update, lambda key, state, num: (), None, fit_config=config.fit)
+            belief = beliefs.Belief(init, update, lambda key, state, num: (), None, fit_config=config.fit)
+            return TASK._replace(belief=belief)
 
-        row = Method("breaks", belief, methods.no_reward, methods.uniform_actions)
+        row = Method("breaks", signal, methods.uniform_actions)
         monkeypatch.setitem(methods.METHODS, "fragile", row)
         original = run.make_programs
 

@@ -11,13 +11,14 @@ import pytest
 from jaxplore import dynamics, replay, rewards
 from jaxplore.behaviours import Experience, ImaginationConfig, ReactiveConfig, make_reactive
 from jaxplore.behaviours.base import LABEL_CHUNK, label
-from jaxplore.beliefs import Belief, EnsembleConfig, make_no_belief
+from jaxplore.beliefs import Belief, EnsembleConfig
 from jaxplore.config import ExplorationConfig, Sizes
 from jaxplore.dynamics import DynamicsConfig, Prediction
 from jaxplore.exploration import make_explorer
 from jaxplore.learners.base import Learner
 from jaxplore.learners.sac import SACConfig
 from jaxplore.methods import METHODS
+from jaxplore.signals import Reward, Seen, make_belief_signal
 from jaxplore.types import Transition
 
 O, A, M = 3, 2, 4  # noqa: E741
@@ -82,8 +83,11 @@ def recorder(batch_size):
     )
 
 
-def variance(prediction, delta, normalizers):
-    return rewards.variance(prediction)
+def read_off_belief(score):
+    return make_belief_signal(BELIEF, Reward(score, "its own"))
+
+
+VARIANCE = read_off_belief(lambda prediction, delta, normalizers: rewards.variance(prediction))
 
 
 @pytest.mark.parametrize(("num_updates", "restart_every", "lives"), [(5, 1, [5, 5, 5]), (7, 2, [7, 14, 7])])
@@ -91,7 +95,7 @@ def test_a_reactive_policy_sees_real_transitions_alone(num_updates, restart_ever
     # every row of a batch is one of the 20 real ones, normalised, with its reward by today's models in place of the
     # environment's 7; as many updates as the settings say, from a new policy each round or every second one
     config = ReactiveConfig(updates=num_updates, restart_every=restart_every)
-    behaviour = make_reactive(BELIEF, variance, recorder(16), O, A, config)
+    behaviour = make_reactive(VARIANCE, recorder(16), O, A, config)
     experience = real_data(20)
     state, improve = jax.jit(behaviour.init)(jax.random.key(0)), jax.jit(behaviour.improve)
     for number, life in enumerate(lives):
@@ -117,9 +121,8 @@ def test_a_reactive_policy_sees_real_transitions_alone(num_updates, restart_ever
 
 @jax.jit
 def labelled_by_spread(experience):
-    return label(
-        BELIEF, lambda prediction, delta, normalizers: rewards.trajectory_spread(delta), experience
-    ).rows.reward
+    spread = read_off_belief(lambda prediction, delta, normalizers: rewards.trajectory_spread(delta))
+    return label(spread, experience).rows.reward
 
 
 @pytest.mark.parametrize("num", [20, LABEL_CHUNK + 10])
@@ -129,12 +132,6 @@ def test_rewards_that_compare_rows_see_held_rows_only(num):
     got = np.asarray(labelled_by_spread(real_data(num, capacity=1_500)))
     np.testing.assert_allclose(got[:num], O, rtol=0.05)
     np.testing.assert_array_equal(got[num:], 0.0)
-
-
-def test_a_reactive_policy_needs_models():
-    # nothing to label by
-    with pytest.raises(ValueError, match="belief predicts nothing, so nothing can be labelled"):
-        make_reactive(make_no_belief(), variance, recorder(4), O, A)
 
 
 def test_settings_are_those_of_maxs_commands():
@@ -169,7 +166,8 @@ def test_rewards_of_the_table():
         prediction, chances = Prediction(means, jnp.full(means.shape, 0.1)), Prediction(jax.nn.softmax(means))
 
         def given(name, prediction=prediction, **settings):
-            return METHODS[name].reward(ExplorationConfig(**settings)).score(prediction, delta, stats)
+            signal = METHODS[name].signal(SIZES, ExplorationConfig(**settings))
+            return signal.score((), Seen(None, prediction, delta, stats))
 
         one_hot = DynamicsConfig(target="one_hot")
         exact = {
@@ -202,11 +200,11 @@ def test_rewards_of_the_table():
 def test_static_beliefs_have_as_many_networks_as_the_settings_say(name):
     # Gaussian ones for nnaisense/max's methods, deterministic ones for the others and on the chain
     method = METHODS[name]
-    belief = method.belief(SIZES, method.settings(SMALL))
+    belief = method.signal(SIZES, method.settings(SMALL)).belief
     models = jax.eval_shape(lambda key: belief.sample(key, belief.init(key), M), jax.random.key(0))
     assert models["output"]["kernel"].shape == (M, 8, O if name == "disagreement" else 2 * O)
     chain = dataclasses.replace(SMALL, dynamics=DynamicsConfig(hidden=(8,), target="one_hot"))
-    belief = method.belief(CHAIN, chain)
+    belief = method.signal(CHAIN, chain).belief
     models = jax.eval_shape(lambda key: belief.sample(key, belief.init(key), M), jax.random.key(0))
     assert models["output"]["kernel"].shape == (M, 8, CHAIN.obs)
 

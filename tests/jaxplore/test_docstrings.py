@@ -12,7 +12,7 @@ import jaxplore
 PACKAGES = ("beliefs", "signals", "learners", "behaviours")
 MODULES = sorted(module.name for module in pkgutil.walk_packages(jaxplore.__path__, "jaxplore."))
 WITHOUT = (
-    *("behaviours.base", "config", "methods", "parts", "signals.base", "signals.task", *PACKAGES),
+    *("behaviours.base", "config", "methods", "parts", "signals.task", *PACKAGES),
     *("_install", "experiments"),
 )
 """Modules of shapes, names and tables, without an example."""

@@ -87,15 +87,15 @@ PLANNED = ("implicit", "disagreement", "max")
 )
 def test_a_method_reads_the_settings_that_it_declares(name, config, sizes):
     # no more, so that what a user sets is refused where it does nothing; and no fewer, so that it is not refused where
-    # it does something. Read while belief, reward and behaviour are made; what all methods share counts for none
+    # it does something. Read while signal and behaviour are made; what all methods share counts for none
     method = METHODS[name]
     config = method.settings(config)
     recorder = Recorder(config)
-    belief, reward = method.belief(sizes, recorder), method.reward(recorder)
-    method.behaviour(sizes, recorder, belief, reward.score)
+    signal = method.signal(sizes, recorder)
+    method.behaviour(sizes, recorder, signal)
     declared = method.reads(config, sizes) - set(SHARED)
     assert declared == method.reads(recorder, sizes) - set(SHARED)
-    if belief.predict is None:
+    if signal.belief.predict is None:
         assert recorder.seen - set(SHARED) == declared
     else:
         # Of every belief the divergence is reported, too.
@@ -116,7 +116,7 @@ def test_the_learner_that_is_read_hangs_on_the_actions():
     # and where they are not known on what departs from the defaults, so that a run's identity has it
     numbers, choices = Sizes(3, 2), Sizes(3, 2, discrete=True)
     changed = dataclasses.replace(CONFIG, ddqn=DDQNConfig(batch_size=8))
-    for name in ("implicit", "icm", "icm_active", "rnd_sac"):
+    for name in ("implicit", "icm", "icm_active", "rnd_sac", "rnd_active"):
         reads = METHODS[name].reads
         assert "sac" in reads(changed, numbers) and "ddqn" not in reads(changed, numbers)
         assert "ddqn" in reads(CONFIG, choices) and "sac" not in reads(CONFIG, choices)
@@ -141,6 +141,7 @@ DELTA, RAW, OF_OBS = "normalised delta, squared", "raw units, squared", "std of 
         ("icm", {"error_units": "delta"}, DELTA),
         ("rnd", {}, UNIT),
         ("rnd_sac", {}, UNIT),
+        ("rnd_active", {}, UNIT),
     ],
 )
 def test_the_intrinsic_reward_has_a_unit(name, settings, unit):

@@ -1,6 +1,7 @@
 """What `jaxplore` exports suffices: a belief is trained, sampled, imagined in and turned into behaviour by it alone."""
 
 import ast
+import functools
 import pathlib
 import subprocess
 import sys
@@ -26,6 +27,7 @@ def test_a_belief_is_trained_sampled_and_imagined_in_by_exported_names():
     disagreement = jx.Reward(
         lambda prediction, delta, normalizers: jx.rewards.variance(prediction), "normalised delta, squared"
     )
+    signal: jx.Signal = jx.make_belief_signal(belief, disagreement)
     sac: jx.Learner = jx.make_sac(2, 2, jx.SACConfig(hidden=(8,), batch_size=16))
     config = jx.ImaginationConfig(
         num_actors=8,
@@ -36,7 +38,7 @@ def test_a_belief_is_trained_sampled_and_imagined_in_by_exported_names():
         real_updates=0,
         replay_capacity=64,
     )
-    behaviour: jx.Behaviour = jx.make_imagination(belief, disagreement.score, sac, 2, 2, config)
+    behaviour: jx.Behaviour = jx.make_imagination(signal, sac, 2, 2, config)
 
     @jax.jit
     def fit(key):
@@ -69,7 +71,7 @@ def test_a_belief_is_trained_sampled_and_imagined_in_by_exported_names():
         """What a rollout of a fixed push meets; and the policy before and after a round, its state and its actions."""
         models_key, rollout_key, init_key, improve_key, act_key = jax.random.split(key, 5)
         models = belief.sample(models_key, state, belief.num_models)
-        world = jx.World(belief, models, normalizers, disagreement.score)
+        world = jx.World(belief, models, normalizers, functools.partial(signal.score, ()))
         push = lambda key, obs: jnp.ones((obs.shape[0], 2))  # noqa: E731
         imagined = jx.rollout(rollout_key, push, world, jnp.zeros((NUM_ACTORS, 2)), HORIZON)
         experience = jx.Experience(models, data, jnp.int32(NUM), normalizers, data.rows.obs[0])

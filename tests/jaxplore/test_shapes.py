@@ -40,12 +40,13 @@ def test_sizes_below_1_are_refused_when_a_part_is_made(factory):
 def test_sizes_below_1_are_refused_by_behaviours_and_explorers():
     # whatever learner and belief they are given
     belief, sac = jx.make_ensemble_belief(O, A, M, dynamics_config=SMALL), jx.make_sac(O, A)
-    score = lambda prediction, delta, normalizers: rewards.variance(prediction)  # noqa: E731
+    reward = jx.Reward(lambda prediction, delta, normalizers: rewards.variance(prediction), "squared")
+    signal = jx.make_belief_signal(belief, reward)
     for make in (
-        lambda obs, action: jx.make_imagination(belief, score, sac, obs, action, jx.ImaginationConfig()),
-        lambda obs, action: jx.make_reactive(belief, score, sac, obs, action),
-        lambda obs, action: jx.make_gradient_policy(belief, score, obs, action),
-        lambda obs, action: jx.make_tree_search(belief, score, obs, action),
+        lambda obs, action: jx.make_imagination(signal, sac, obs, action, jx.ImaginationConfig()),
+        lambda obs, action: jx.make_reactive(signal, sac, obs, action),
+        lambda obs, action: jx.make_gradient_policy(signal, obs, action),
+        lambda obs, action: jx.make_tree_search(signal, obs, action),
         lambda obs, action: jx.make_model_free(sac, obs, action),
         lambda obs, action: jx.make_explorer(jx.get_method("random"), jx.Sizes(obs, action), jx.ExplorationConfig()),
     ):

@@ -13,6 +13,7 @@ from jaxplore.dynamics import Prediction
 from jaxplore.exploration import make_explorer
 from jaxplore.learners.ddqn import DDQNConfig, make_ddqn
 from jaxplore.methods import METHODS
+from jaxplore.signals import Reward, make_belief_signal
 from jaxplore.types import Transition
 from tests.jaxplore import programs
 
@@ -45,8 +46,8 @@ def predict(models, inputs):
 def learned(config, learner):
     """The behaviour and its state after a round, from past states -1 and 1, as NumPy arrays."""
     belief = make_no_belief()._replace(predict=predict)
-    score = lambda prediction, delta, normalizers: rewards.variance(prediction)  # noqa: E731
-    behaviour = make_imagination(belief, score, learner, 1, 2, config, discrete=True)
+    reward = Reward(lambda prediction, delta, normalizers: rewards.variance(prediction), "its own")
+    behaviour = make_imagination(make_belief_signal(belief, reward), learner, 1, 2, config, discrete=True)
     obs, flag = jnp.array([[-1.0], [1.0]]), jnp.zeros(2, bool)
     rows = Transition(obs, jnp.eye(2), jnp.zeros(2), -obs, flag, flag)
     data = replay.add(replay.init(jax.tree.map(lambda leaf: leaf[0], rows), 2), rows)

@@ -14,6 +14,7 @@ from jaxplore.dynamics import Prediction
 from jaxplore.exploration import make_explorer
 from jaxplore.methods import METHODS
 from jaxplore.networks import TanhGaussianPolicy
+from jaxplore.signals import Signal
 from jaxplore.types import Transition
 
 OBS, ACTION, BEST = 2, 1, 0.6
@@ -31,8 +32,8 @@ def predict(models, inputs):
     return Prediction(models[:, None, None] * jnp.sin(obs + 2 * action)[None])
 
 
-def variance(prediction, delta, normalizers):
-    return rewards.variance(prediction)
+def variance(seen):
+    return rewards.variance(seen.prediction)
 
 
 def written_out(key, models, policy, params, start, horizon):
@@ -96,6 +97,10 @@ def make_belief(predict):
     return beliefs.make_no_belief()._replace(predict=predict)
 
 
+def variance_of(belief):
+    return Signal(lambda own, seen: variance(seen), "its own", belief)
+
+
 @jax.jit
 def experience():
     obs, num = jax.random.normal(jax.random.key(5), (64, OBS)), 64
@@ -124,7 +129,7 @@ def climbers():
         config = GradientPolicyConfig(
             updates=300, batch_size=32, lr=1e-2, hidden=(8,), restart=restart, **{"policy_penalty": 0.0, **settings}
         )
-        behaviour = make_gradient_policy(make_belief(bent), variance, OBS, ACTION, config)
+        behaviour = make_gradient_policy(variance_of(make_belief(bent)), OBS, ACTION, config)
 
         @jax.jit
         def one_round(init_key, improve_key):
@@ -153,8 +158,9 @@ def test_a_round_starts_from_a_new_policy_or_continues(climbers):
 
 
 def test_refusals():
+    chances = variance_of(make_belief(predict)._replace(encoding=dynamics.ONE_HOT))
     with pytest.raises(ValueError, match=r"cannot be differentiated\. Allowed: .*target='delta'"):
-        make_gradient_policy(beliefs.make_no_belief(), variance, OBS, ACTION)
+        make_gradient_policy(chances, OBS, ACTION)
     with pytest.raises(ValueError, match=r"GradientPolicyConfig\.horizon=0 .*1 or more"):
         GradientPolicyConfig(horizon=0)
     with pytest.raises(ValueError, match=r"method='implicit_grad' takes .*numbers.*one of 2 choices.*Allowed: "):

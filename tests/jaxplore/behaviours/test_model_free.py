@@ -109,7 +109,7 @@ def ddqn_act(sizes, normalize_obs, epsilon=0.0):
     ddqn = DDQNConfig(hidden=(8,), epsilon_start=epsilon, epsilon_end=epsilon, lr=0.1)
     config = ExplorationConfig(ddqn=ddqn, model_free=ModelFreeConfig(normalize_obs=normalize_obs))
     method = METHODS["ddqn"]
-    behaviour = method.behaviour(sizes, config, method.belief(sizes, config), method.reward(config).score)
+    behaviour = method.behaviour(sizes, config, method.signal(sizes, config))
     obs = np.linspace(20.0, 80.0, 50, dtype=np.float32).reshape(10, 5)
     learner, experience = make_ddqn(5, 3, ddqn), experience_of(obs, np.zeros(10, np.float32))
 

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 
 from jaxplore import dynamics, normalizer, replay
-from jaxplore.behaviours import Experience, ReactiveConfig, make_rnd_learner, make_rnd_ppo
-from jaxplore.behaviours.distillation import newest
+from jaxplore.behaviours import Experience, ReactiveConfig, make_on_policy, make_reactive
 from jaxplore.config import ExplorationConfig, Sizes
 from jaxplore.exploration import make_explorer
 from jaxplore.learners.base import Learner
 from jaxplore.learners.ppo import PPOConfig
 from jaxplore.learners.sac import SACConfig
 from jaxplore.methods import METHODS
-from jaxplore.signals.distillation import RNDConfig
+from jaxplore.signals.distillation import RNDConfig, make_distillation, newest
 from jaxplore.types import Transition
 from tests.jaxplore import distillation
 
@@ -23,6 +22,7 @@ SMALL = RNDConfig(hidden=(16,), features=8, lr=3e-3)
 
 OBS, ACTION, PER_ROUND, WARM_UP = 2, 1, 3, 4
 PPO = PPOConfig(hidden=(4,), rollout_steps=8, minibatch_size=4, epochs=1)
+SIGNAL = make_distillation(OBS, PER_ROUND, SMALL)
 
 
 def rows(first, count):
@@ -63,7 +63,7 @@ def test_what_a_round_brought_is_found_in_the_replay(capacity):
     # by their numbers, whether or not the replay has wrapped around; nothing the first time
     find, position = jax.jit(newest, static_argnums=2), np.int32(-1)
     for i, experience in enumerate(rounds(8, capacity)):
-        found, valid, position = find(experience, position, PER_ROUND)
+        found, valid, position = find(experience.data, position, PER_ROUND)
         assert np.sum(valid) == (PER_ROUND if i else 0)
         want = WARM_UP + PER_ROUND * (i - 1) + np.arange(PER_ROUND)
         np.testing.assert_array_equal(found.obs[:, 0][valid], want if i else [])
@@ -73,17 +73,17 @@ def test_what_a_round_brought_is_found_in_the_replay(capacity):
 def test_ppo_learns_every_so_many_steps_from_the_steps_of_its_own_policy():
     # 4 random steps, then 3 a round, 8 an update: after 9, 18, 24 of its own, with no random ones among them, though
     # the replay wraps around; statistics and policy stand still in between
-    behaviour = make_rnd_ppo(OBS, ACTION, PER_ROUND, WARM_UP, PPO, SMALL)
+    behaviour = make_on_policy(SIGNAL, OBS, ACTION, PER_ROUND, WARM_UP, PPO)
     seen = play(behaviour, 8, 7)
     assert [int(metrics["updated"]) for _, metrics, _ in seen] == [0, 0, 0, 1, 0, 0, 1, 0, 1]
     assert [int(state.num) for state, _, _ in seen] == [0, 3, 6, 0, 3, 6, 0, 3, 0]
     np.testing.assert_array_equal(seen[2][0].steps.obs[:6, 0], WARM_UP + np.arange(6))
     np.testing.assert_array_equal(seen[5][0].steps.obs[:6, 0], WARM_UP + 9 + np.arange(6))
     for i in (1, 2, 4, 5):
-        for part in ("ppo", "rnd", "obs", "scale"):
+        for part in ("ppo", "own", "obs"):
             jax.tree.map(np.testing.assert_array_equal, getattr(seen[i][0], part), getattr(seen[i - 1][0], part))
     for i in (3, 6, 8):
-        for part in ("ppo", "rnd", "obs"):
+        for part in ("ppo", "own", "obs"):
             before, after = (jax.tree.leaves(getattr(seen[k][0], part)) for k in (i - 1, i))
             assert any(not np.array_equal(a, b) for a, b in zip(before, after, strict=True)), part
         jax.tree.map(np.testing.assert_array_equal, seen[i][0].obs, seen[i][2].obs)
@@ -94,7 +94,7 @@ def test_probabilities_are_those_under_the_policy_that_acted():
     # with one gradient step per update the ratio is 1: nothing is clipped, no divergence, though the statistics of all
     # data have moved meanwhile. Updates come when they do in a replay that wraps around
     config = PPOConfig(hidden=(4,), rollout_steps=8, minibatch_size=8, epochs=1)
-    behaviour = make_rnd_ppo(OBS, ACTION, PER_ROUND, WARM_UP, config, SMALL)
+    behaviour = make_on_policy(SIGNAL, OBS, ACTION, PER_ROUND, WARM_UP, config)
     seen = play(behaviour, 6, 100)
     assert [int(metrics["updated"]) for _, metrics, _ in seen] == [0, 0, 0, 1, 0, 0, 1]
     assert [int(state.num) for state, _, _ in seen] == [0, 3, 6, 0, 3, 6, 0]
@@ -107,45 +107,51 @@ def test_probabilities_are_those_under_the_policy_that_acted():
     np.testing.assert_array_equal(one, other)
 
 
-@pytest.mark.parametrize("normalize_reward", [False, True])
-def test_a_learner_gets_the_bonus_of_successors_as_reward(normalize_reward):
+@pytest.mark.parametrize(("normalize_reward", "std_draws"), [(False, 0), (True, 0), (True, 1024)])
+def test_a_learner_gets_the_bonus_of_successors_as_reward(normalize_reward, std_draws):
     # what it is shown: normalised observations and errors of the predictor as it is after the round, over the spread
     # of their sum in time or over their own
-    def update(key, state, batch):
-        return batch, {"mean": jnp.mean(batch.reward)}
-
     batch = rows(0, 8)
     spy = Learner(
         init=lambda key: jax.tree.map(jnp.asarray, batch),
         actor=lambda state: (),
         act=lambda key, actor, obs: obs[..., :1],
         act_greedily=lambda actor, obs: -obs[..., :1],
-        update=update,
+        update=lambda key, state, batch: (batch, {"mean": jnp.mean(batch.reward)}),
         batch_size=8,
     )
     config = ReactiveConfig(updates=2, normalize_reward=normalize_reward)
-    behaviour = make_rnd_learner(spy, OBS, PER_ROUND, config, SMALL)
-    seen = play(behaviour, 3, 100)
-    jax.tree.map(np.testing.assert_array_equal, seen[0][0].rnd, jax.jit(behaviour.init)(jax.random.key(0)).rnd)
-    for state, metrics, normalizers in seen[1:]:
-        shown = state.learner
-        mean, std = (np.asarray(leaf)[None] for leaf in (normalizers.obs.mean, normalizers.obs.std))
+    behaviour = make_reactive(SIGNAL, spy, OBS, ACTION, config, lasting=True, std_draws=std_draws)
+
+    @jax.jit
+    def one_round(key, own, experience):
+        own, metrics = SIGNAL.fit(own, experience.data, experience.normalizers)
+        return own, metrics, behaviour.improve(key, behaviour.init(key), experience._replace(own=own))[0]
+
+    first = own = jax.jit(SIGNAL.init)(jax.random.key(0))
+    for i, experience in enumerate(rounds(3, 100)):
+        own, metrics, shown = jax.device_get(one_round(jax.random.key(i), own, experience))
+        if i == 0:
+            # The random steps teach nothing.
+            jax.tree.map(np.testing.assert_array_equal, own.rnd, first.rnd)
+            continue
+        obs = experience.normalizers.obs
+        mean, std = (np.asarray(leaf)[None] for leaf in (obs.mean, obs.std))
         np.testing.assert_allclose((shown.obs * std + mean + 1)[:, 0], (shown.next_obs * std + mean)[:, 0], atol=1e-4)
         # the second entry of all observations is 0, so that 1 is 1,000 of the smallest standard deviation away
         np.testing.assert_array_equal(shown.next_obs[:, 1], normalizer.LIMIT)
-        errors, spread = distillation.error(state.rnd, shown.next_obs), float(state.scale.std)
+        errors, spread = distillation.error(own.rnd, shown.next_obs), float(own.scale.std)
         if normalize_reward:
             # the successors of all rows so far; 1,024 draws of them have their spread within a tenth
-            held = np.arange(1.0, state.position + 1)
+            held = np.arange(1.0, own.position + 1)
             every = np.stack([held, np.ones(len(held))], axis=1)
-            spread = float(np.std(distillation.error(state.rnd, np.clip((every - mean) / std, -10, 10))))
-        np.testing.assert_allclose(shown.reward, errors / spread, rtol=0.1 if normalize_reward else 1e-4)
-        assert float(metrics["intrinsic_reward"]) > 0
-    before, after = (np.asarray(state.rnd.predictor["output"]["kernel"]) for state, _, _ in seen[:2])
-    assert not np.array_equal(before, after)
+            spread = float(np.std(distillation.error(own.rnd, np.clip((every - mean) / std, -10, 10))))
+        np.testing.assert_allclose(shown.reward, errors / spread, rtol=0.1 if std_draws else 1e-3)
+        assert float(metrics["rnd_error"]) > 0
+        assert not np.array_equal(own.rnd.predictor["output"]["kernel"], first.rnd.predictor["output"]["kernel"])
 
 
-@pytest.mark.parametrize("name", ["rnd", "rnd_sac"])
+@pytest.mark.parametrize("name", ["rnd", "rnd_sac", "rnd_active"])
 def test_the_distillation_error_of_new_transitions_is_reported(name):
     # by hand, of valid rows alone, on observations normalised as the predictor sees them: by all data, or with PPO once
     # it has started by the statistics of its last update, here mean 0 and standard deviation 1
@@ -155,6 +161,7 @@ def test_the_distillation_error_of_new_transitions_is_reported(name):
         ppo=PPO,
         rnd=SMALL,
         sac=SACConfig(hidden=(4,), batch_size=4),
+        dynamics=dynamics.DynamicsConfig(hidden=(4,)),
     )
     explorer = make_explorer(METHODS[name], Sizes(OBS, ACTION), config)
     taken, valid = rows(0, 12), np.arange(7) % 3 != 1
@@ -162,10 +169,12 @@ def test_the_distillation_error_of_new_transitions_is_reported(name):
     state, assess, new = start(jax.random.key(0)), jax.jit(explorer.assess), rows(20, 7)
 
     def reported_and_wanted(state, mean, std):
-        want = distillation.error(jax.device_get(state.behaviour.rnd), (new.next_obs[valid] - mean) / std)
+        own = state.behaviour.own if name == "rnd" else state.signal
+        want = distillation.error(jax.device_get(own.rnd), (new.next_obs[valid] - mean) / std)
         got = assess(jax.random.key(1), state, new, valid)
-        assert got.keys() == {"intrinsic_reward", "intrinsic_reward_p95"} and np.min(want) > 0
-        return [float(value) for value in got.values()], [np.mean(want), np.percentile(want, 95)]
+        assert ("variance" in got) == (name == "rnd_active") and np.min(want) > 0
+        told = [float(got[field]) for field in ("intrinsic_reward", "intrinsic_reward_p95")]
+        return told, [np.mean(want), np.percentile(want, 95)]
 
     # a constant entry has the smallest standard deviation that is divided by
     std = np.maximum(np.std(taken.obs, axis=0), 1e-3)
@@ -177,11 +186,10 @@ def test_the_distillation_error_of_new_transitions_is_reported(name):
 
 def test_refusals():
     with pytest.raises(ValueError, match=r"PPOConfig\.rollout_steps=8 .*at least steps_per_round=9"):
-        make_rnd_ppo(OBS, ACTION, 9, WARM_UP, PPO, SMALL)
+        make_on_policy(SIGNAL, OBS, ACTION, 9, WARM_UP, PPO)
     with pytest.raises(ValueError, match=r"RNDConfig\.features=0 .*1 or more"):
         RNDConfig(features=0)
-    for name in ("rnd", "rnd_sac"):
+    for name in ("rnd", "rnd_sac", "rnd_active"):
         method, config = METHODS[name], ExplorationConfig(data_capacity=25)
-        belief, score = method.belief(Sizes(3, 1), config), method.reward(config).score
         with pytest.raises(ValueError, match=r"data_capacity=25 .*at least steps_per_round \+ 1 = 26"):
-            method.behaviour(Sizes(3, 1), config, belief, score)
+            method.signal(Sizes(3, 1), config)

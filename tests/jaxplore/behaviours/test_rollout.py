@@ -37,9 +37,9 @@ def predict(models, inputs):
     return Prediction(jnp.einsum("moi,ni->mno", models, inputs))
 
 
-def reward(prediction, delta, normalizers):
+def reward(seen):
     # Tells models apart, and the delta that happened from those that did not.
-    return jnp.sum(prediction.mean[:, :, 0], axis=0) + 10 * delta[:, 0]
+    return jnp.sum(seen.prediction.mean[:, :, 0], axis=0) + 10 * seen.delta[:, 0]
 
 
 def world_of(models, predict=predict, score=reward):
@@ -125,7 +125,7 @@ def test_models_that_state_a_variance_are_drawn_from():
 
     @functools.partial(jax.jit, static_argnums=0)
     def moved(mover):
-        world = world_of(jnp.asarray(MODELS[:1]), stating, lambda prediction, delta, _: delta[:, 1])
+        world = world_of(jnp.asarray(MODELS[:1]), stating, lambda seen: seen.delta[:, 1])
         return rollout(jax.random.key(0), act, world, jnp.asarray(start), 1, mover)
 
     def changes(mover):

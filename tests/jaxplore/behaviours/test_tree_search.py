@@ -18,6 +18,7 @@ from jaxplore.config import ExplorationConfig, Sizes
 from jaxplore.dynamics import ONE_HOT, DynamicsConfig, Prediction
 from jaxplore.exploration import make_explorer
 from jaxplore.methods import METHODS
+from jaxplore.signals import Reward, make_belief_signal
 from jaxplore.types import Transition
 from tests.jaxplore import programs
 
@@ -56,13 +57,14 @@ def experience(models):
     return Experience(models, replay.init(row, 8), jnp.int32(0), NORMALIZERS, jnp.eye(NUM_STATES)[1])
 
 
-def variance(prediction, delta, normalizers):
-    return rewards.variance(prediction)
+def variance_of(belief):
+    reward = Reward(lambda prediction, delta, normalizers: rewards.variance(prediction), "probability, squared")
+    return make_belief_signal(belief, reward)
 
 
 def improved(belief, models=None, **config):
     """`(behaviour, state, metrics)` after a round."""
-    behaviour = make_tree_search(belief, variance, NUM_STATES, NUM_ACTIONS, MCTSConfig(**config))
+    behaviour = make_tree_search(variance_of(belief), NUM_STATES, NUM_ACTIONS, MCTSConfig(**config))
     one_round = jax.jit(lambda key, models: behaviour.improve(key, behaviour.init(key), experience(models)))
     return behaviour, *one_round(jax.random.key(0), np.arange(NUM_MODELS) if models is None else models)
 
@@ -226,5 +228,5 @@ def test_what_does_not_fit_is_refused():
         DynamicsConfig(target="onehot")  # pyright: ignore[reportArgumentType]
     with pytest.raises(ValueError, match=r"model_step='sample' needs probabilities"):
         make_explorer(implicit, SIZES, dataclasses.replace(delta, mcts=MCTSConfig(model_step="sample")))
-    with pytest.raises(ValueError, match="belief predicts nothing, so nothing can be searched"):
-        make_explorer(METHODS["random"]._replace(behaviour=implicit.behaviour), SIZES, SMALL)
+    with pytest.raises(ValueError, match="belief predicts nothing, so the signal cannot be imagined"):
+        make_explorer(METHODS["rnd"]._replace(behaviour=implicit.behaviour, actions="any"), SIZES, SMALL)
