@@ -160,6 +160,7 @@ def init(agent: Agent, key: Key) -> ExplorerState:
     example = Transition(jnp.zeros(sizes.obs), jnp.zeros(sizes.action), jnp.zeros(()), jnp.zeros(sizes.obs), flag, flag)
     belief_key, behaviour_key = jax.random.split(key)
     own = ()
+    # What carries nothing takes no key either.
     if agent.carries:
         assert agent.signal.init is not None
         behaviour_key, own_key = jax.random.split(behaviour_key)
@@ -245,24 +246,24 @@ def assess(agent: Agent, key: Key, state: ExplorerState, transitions: Transition
     rows = jax.tree.map(lambda leaf: leaf[order], transitions)
     counts = jnp.arange(valid.shape[0]) < count
     models = belief.sample(key, state.belief, belief.num_models)
-    metrics = {}
+    of_each = {}
     if agent.behaviour.score:
-        given = agent.behaviour.score(state.behaviour, state.normalizers, rows)
-        metrics |= _spread("intrinsic_reward", jnp.where(counts, given, jnp.nan))
+        of_each["intrinsic_reward"] = agent.behaviour.score(state.behaviour, state.normalizers, rows)
     elif signal.score:
-        given = signal.judge(models, state.signal, state.normalizers, rows)
-        metrics |= _spread("intrinsic_reward", jnp.where(counts, given, jnp.nan))
+        of_each["intrinsic_reward"] = signal.judge(models, state.signal, state.normalizers, rows)
     if belief.predict is None:
-        return metrics
+        return _spreads(of_each, counts)
     prediction, delta = belief.judge(models, state.normalizers, rows)
-    for name, values in (
-        ("variance", rewards.variance(prediction)),
-        ("divergence", agent.divergence(prediction, delta, state.normalizers)),
-    ):
-        metrics |= _spread(name, jnp.where(counts, values, jnp.nan))
+    of_each["variance"] = rewards.variance(prediction)
+    of_each["divergence"] = agent.divergence(prediction, delta, state.normalizers)
     errors = jnp.mean((jnp.mean(prediction.mean, axis=0) - delta) ** 2, axis=-1)
-    return {**metrics, "model_error": jnp.nanmean(jnp.where(counts, errors, jnp.nan))}
+    return {**_spreads(of_each, counts), "model_error": jnp.nanmean(jnp.where(counts, errors, jnp.nan))}
 
 
-def _spread(name: str, values: Array) -> Metrics:
-    return {name: jnp.nanmean(values), f"{name}_p95": jnp.nanpercentile(values, 95.0)}
+def _spreads(of_each: dict[str, Array], counts: Array) -> Metrics:
+    """Mean and 95th percentile of each, over the rows that count."""
+    metrics = {}
+    for name, values in of_each.items():
+        held = jnp.where(counts, values, jnp.nan)
+        metrics |= {name: jnp.nanmean(held), f"{name}_p95": jnp.nanpercentile(held, 95.0)}
+    return metrics

@@ -68,7 +68,10 @@ def test_no_reward_no_method(
     ("words", "message"),
     [
         ("--method=random --sac.lr=1e-3", r"--sac\.lr does nothing with method='random'.*methods implicit, .*rnd_sac"),
-        ("--rnd.lr=1e-3", r"--rnd\.lr does nothing with method='implicit'.*Allowed: .* methods rnd, rnd_sac\."),
+        (
+            "--rnd.lr=1e-3",
+            r"--rnd\.lr does nothing with method='implicit'.*Allowed: .* methods rnd, rnd_sac, rnd_active\.",
+        ),
         ("--method=icm --imagination.horizon=5", r"--imagination\.horizon does nothing with method='icm'"),
         (
             "--method=max --svgd.num-particles=4",
