@@ -214,7 +214,9 @@ def loss(
     config = parts.config
     world = world_of(parts.signal, experience)
     expected, (rewards, gaussian) = imagined_return(key, parts.policy, params, world, start, config)
-    scale = jnp.maximum(jnp.mean(jnp.abs(jax.lax.stop_gradient(rewards))), 1e-6) if config.normalize_reward else 1.0
+    scale = parts.signal.std(experience.own)
+    if config.normalize_reward:
+        scale = jnp.maximum(jnp.mean(jnp.abs(jax.lax.stop_gradient(rewards))), 1e-6)
     metrics = {
         "imagined_return": expected,
         "imagined_reward": jnp.mean(rewards),
