@@ -149,8 +149,7 @@ def learn_round(
     seen = explorer.assess(assess_key, state, *rows)
     after, metrics = explorer.improve(improve_key, explorer.observe(state, *rows), obs, num_data)
     # The state too: what the last update of a round broke would show in the next round's metrics only.
-    parts = {"belief": after.belief, "behaviour": after.behaviour, "normalizers": after.normalizers}
-    parts["signal"] = after.signal
+    parts = {name: getattr(after, name) for name in ("belief", "signal", "behaviour", "normalizers")}
     finite = {name: jnp.isfinite(value) for name, value in metrics.items()}
     finite |= {f"the state of the {name}": all_finite(part) for name, part in parts.items()}
     return after, {**seen, **metrics}, finite
