@@ -168,7 +168,8 @@ def learn_side_by_side(
     learn = functools.partial(learn_round, explorer)
     if alive.shape[0] == 1:
         # Not under `vmap`: with an axis more, if only of 1, XLA on CPUs turns matrices that could lie as they are.
-        only = learn(*jax.tree.map(lambda leaf: leaf[0], (keys, state, rows, obs)), num_data)
+        own_key, own_state, own_rows, own_obs = jax.tree.map(lambda leaf: leaf[0], (keys, state, rows, obs))
+        only = learn(own_key, own_state, own_rows, own_obs, num_data)
         after, metrics, finite = jax.tree.map(lambda leaf: leaf[None], only)
     else:
         after, metrics, finite = jax.vmap(learn, in_axes=(0, 0, 0, 0, None))(keys, state, rows, obs, num_data)

@@ -140,8 +140,8 @@ def test_two_seeds_are_two_runs(finished, tell, tmp_path: Path):
                 other for other in rows(both.out) if (other["step"], other["seed"]) == (row["step"], row["seed"])
             ]
             assert row.keys() == twin.keys()
-            # Each round magnifies the rounding of those before it, by how much hangs on the CPU: a seed alone is another
-            # program than two under `vmap`.
+            # Each round magnifies the rounding of those before it, by how much hangs on the CPU: one seed and two are
+            # two programs.
             rel = {75: 2e-1, 81: 3e-1}.get(row["step"], 2e-3)
             for name in row:
                 assert twin[name] == pytest.approx(row[name], rel=rel, abs=1e-4), (name, row["step"])
