@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from jaxplore import dynamics, networks, replay, validate
 from jaxplore.beliefs.base import Belief, FitConfig, make_optimizer
+from jaxplore.beliefs.ensemble import Bootstrap, member_weights
 from jaxplore.beliefs.generator import Generator, GeneratorConfig, make_generator
 from jaxplore.beliefs.svgd import AmortizedSVGD, SVGDConfig, SVGDState, make_amortized_svgd
 from jaxplore.dynamics import ENCODINGS, DynamicsConfig, Encoding, Normalizers, Prediction
@@ -32,6 +33,8 @@ class GeneratorBelief(NamedTuple):
     svgd: SVGDConfig
     num_generators: int
     """K, each with its own state along a leading axis where there are several."""
+    bootstrap: Bootstrap
+    bootstrap_std: float
 
 
 def make_generator_belief(
@@ -83,7 +86,16 @@ def make_generator_belief(
     posterior = make_amortized_svgd(generator, apply, obs_size, make_optimizer(fit_config), svgd_config)
     input_size = obs_size + action_size
     parts = GeneratorBelief(
-        generator, posterior, apply, encoding, input_size, fit_config.batch_size, svgd_config, count
+        generator,
+        posterior,
+        apply,
+        encoding,
+        input_size,
+        fit_config.batch_size,
+        svgd_config,
+        count,
+        generator_config.bootstrap,
+        generator_config.bootstrap_std,
     )
     return Belief(
         init=functools.partial(init, parts),
@@ -110,17 +122,27 @@ def update(
     if parts.num_generators == 1:
         return update_one(parts, key, state, data, normalizers)
     keys = jax.random.split(key, parts.num_generators)
-    one = jax.vmap(functools.partial(update_one, parts), in_axes=(0, 0, None, None))
-    state, metrics = one(keys, state, data, normalizers)
+    one = jax.vmap(functools.partial(update_one, parts), in_axes=(0, 0, None, None, 0))
+    state, metrics = one(keys, state, data, normalizers, jnp.arange(parts.num_generators))
     return state, {name: jnp.mean(values) for name, values in metrics.items()}
 
 
 def update_one(
-    parts: GeneratorBelief, key: Key, state: SVGDState, data: Replay[Transition], normalizers: Normalizers
+    parts: GeneratorBelief,
+    key: Key,
+    state: SVGDState,
+    data: Replay[Transition],
+    normalizers: Normalizers,
+    number: int | Array = 0,
 ) -> tuple[SVGDState, Metrics]:
-    """`update` of one generator."""
+    """`update` of one generator, the `number`-th."""
     batch_key, extra_key, update_key = jax.random.split(key, 3)
-    batch = replay.sample(batch_key, data, parts.batch_size)
+    own = parts.svgd.num_particles if parts.svgd.batches == "own" else 0
+    index = replay.choose(batch_key, data, max(own, 1) * parts.batch_size)
+    index = index.reshape(own, -1) if own else index
+    batch, weights = replay.take(data, index), None
+    if parts.bootstrap != "none":
+        weights = member_weights(parts.bootstrap, parts.num_generators, number, index, parts.bootstrap_std)
     inputs = parts.encoding.inputs(normalizers, batch.obs, batch.action)
     targets = parts.encoding.targets(normalizers, batch.obs, batch.next_obs)
     extra_inputs = None
@@ -128,7 +150,7 @@ def update_one(
         extra = replay.sample(extra_key, data, parts.batch_size)
         extra_inputs = parts.encoding.inputs(normalizers, extra.obs, extra.action)
     num_data = jnp.maximum(data.size, 1)
-    return parts.posterior.update(update_key, state, inputs, targets, num_data, extra_inputs)
+    return parts.posterior.update(update_key, state, inputs, targets, num_data, extra_inputs, weights)
 
 
 def sample(parts: GeneratorBelief, key: Key, state: SVGDState, num: int) -> Params:
