@@ -58,6 +58,11 @@ class GeneratorConfig:
     `EnsembleConfig.bootstrap`."""
     bootstrap_std: float = 1.0
     """Standard deviation of those weights, in (0, 1]."""
+    prior_scale: float = 0.0
+    """Standard deviation of a random function of z and the inputs that is added to each network and never trained, so
+    that networks differ where no data tell them to agree (Osband et al. 2018; linear in z as in Dwaracherla et al.
+    2020); in output units, at inputs of one standard deviation. 0: none. Features no fewer than `noise_size` can learn
+    to make up for it."""
     bias_std: float = 0.1
     """The same for entries of leaves with fewer than two axes (biases, scales), around the example's value."""
 
@@ -73,6 +78,7 @@ class GeneratorConfig:
         checks.at_least("num_generators", 1)
         checks.one_of("bootstrap", get_args(Bootstrap))
         checks.in_range("bootstrap_std", 0.0, 1.0, open_low=True)
+        checks.in_range("prior_scale", 0.0)
 
 
 class Generator(NamedTuple):

@@ -83,6 +83,8 @@ def make_generator_belief(
         raise FieldError("num_generators", count, allowed, "shares the networks unequally", "GeneratorConfig")
     svgd_config = dataclasses.replace(svgd_config, num_particles=svgd_config.num_particles // count)
     apply = functools.partial(_run, network, encoding)
+    if generator_config.prior_scale:
+        generator, apply = add_prior(generator, generator_config.prior_scale, network, encoding, obs_size + action_size)
     posterior = make_amortized_svgd(generator, apply, obs_size, make_optimizer(fit_config), svgd_config)
     input_size = obs_size + action_size
     parts = GeneratorBelief(
@@ -106,6 +108,48 @@ def make_generator_belief(
         num_models=svgd_config.num_particles * count,
         fit_config=fit_config,
     )
+
+
+def add_prior(
+    generator: Generator, scale: float, network: networks.MLP, encoding: Encoding, input_size: int
+) -> tuple[Generator, Callable[[Params, Array], Array]]:
+    """A generator whose networks have a random function added to them that is never trained; see
+    `GeneratorConfig.prior_scale`.
+
+    The function is the last layer, drawn linearly from z, of a random network with the hidden layers of `network`.
+
+    Args:
+        generator: of networks like `network`.
+        scale: standard deviation of the function's values, over z and standard normal inputs.
+        network: architecture of a dynamics network.
+        encoding: how its last layer is read.
+        input_size: `I`.
+
+    Returns:
+        `(generator, apply)`: parameters are `{"network": ..., "prior": [width, O]}`, and `apply(params, inputs [N, I])`
+        gives `[N, O]`.
+    """
+    # Fixed keys, as for the example: what is frozen follows from the settings alone.
+    features_key, map_key, inputs_key = jax.random.split(jax.random.key(1), 3)
+    features = networks.MLP(network.hidden[:-1], network.hidden[-1], network.activation, "he", "he")
+    frozen = features.init(features_key, jnp.zeros(input_size))["params"]
+
+    def features_of(inputs: Array) -> Array:
+        return networks.ACTIVATIONS[network.activation](networks.apply(features, frozen, inputs))
+
+    power = jnp.mean(jnp.sum(features_of(jax.random.normal(inputs_key, (512, input_size))) ** 2, axis=1))
+    z_size = jax.eval_shape(lambda: generator.sample_noise(map_key, 1)).size
+    shape = (z_size, network.hidden[-1], network.output_size)
+    from_z = scale / jnp.sqrt(power * z_size) * jax.random.normal(map_key, shape)
+
+    def generate(eta: Params, z: Array) -> Params:
+        return {"network": generator.generate(eta, z), "prior": jnp.tensordot(z.reshape(-1), from_z, axes=1)}
+
+    def apply(params: Params, inputs: Array) -> Array:
+        prior = features_of(inputs) @ params["prior"]
+        return encoding.outputs(networks.apply(network, params["network"], inputs) + prior)
+
+    return generator._replace(generate=generate, sample=jax.vmap(generate, in_axes=(None, 0))), apply
 
 
 def init(parts: GeneratorBelief, key: Key) -> SVGDState:
