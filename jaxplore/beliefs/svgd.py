@@ -497,7 +497,8 @@ def make_amortized_svgd(
         `AmortizedSVGD(init, update)`. `update` draws m networks, moves eta once, and reports `loss` (mean squared
         error per output), `variance` (of the networks' predictions on the batch, mean over points and outputs),
         `repulsion_variance` (the same at the repulsion points: watch it for growth), `bandwidth`, `kernel_mean`,
-        `likelihood_std` and `gradient_norm`.
+        `likelihood_std` and `gradient_norm`. With `batches="own"` there is nothing to compare networks on: it reports
+        `loss`, `likelihood_std` and `gradient_norm`.
 
     Warns:
         UserWarning: points beyond the data with a flat prior: no posterior exists there, the variance keeps growing.
