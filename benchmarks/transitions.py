@@ -6,6 +6,7 @@ pitch rates from all over the grid, and its first steps are left out.
 """
 
 import argparse
+import dataclasses
 import sys
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -91,10 +92,10 @@ def walk_from_any_speed(env: Environment, key: Key, act: Act) -> Transition:
     fastest, found = jnp.array(half_cheetah.FASTEST), []
     for start_key in jax.random.split(key, ask.STARTS):
         state = env.reset(start_key)
-        qpos, qvel = jax.device_get(half_cheetah.start(start_key))
-        qvel = np.array(qvel)
+        qpos, start_qvel = jax.device_get(half_cheetah.start(start_key))
+        qvel: Any = np.array(start_qvel)
         qvel[[0, 2]] = jax.random.uniform(jax.random.fold_in(start_key, 0), (2,), minval=-fastest, maxval=fastest)
-        state = state.replace(physics=physics.init(qpos, qvel))
+        state = dataclasses.replace(state, physics=physics.init(qpos, qvel))
         for t in range(1 + ask.STEPS_EACH):
             state, transition = env.step(state, act(jax.random.fold_in(start_key, t + 1), jnp.asarray(state.obs)))
             found += [transition] if t else []
