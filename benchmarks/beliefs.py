@@ -7,7 +7,7 @@ Flags are those of `python -m experiments.run`, with the presets' values as defa
 import json
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ from jaxplore.beliefs.base import Belief
 from jaxplore.config import ExplorationConfig, Sizes
 from jaxplore.methods import METHODS
 from jaxplore.signals import rewards
-from jaxplore.types import Transition
+from jaxplore.types import Key, Transition, no_metrics
 
 STEPS = 4_000
 """Gradient steps of a fit: what 4,000 steps of the maze come to with the laptop's settings."""
@@ -65,25 +65,42 @@ class Verdict(NamedTuple):
     """Of one gradient step, compiling aside."""
 
 
-def fit(belief: Belief, data: Transition, normalizers: dynamics.Normalizers, steps: int, seed: int) -> tuple[Any, ...]:
-    """A belief's state after so many gradient steps on transitions `[N, ...]`: `(state, metrics, ms a step)`."""
-    size = len(data.obs)
-    held = replay.add(replay.init(jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), data), size), data)
-    init_key, steps_key = jax.random.split(jax.random.key(seed))
+class Fit(NamedTuple):
+    """What came of gradient steps on transitions."""
+
+    state: Any
+    metrics: dict[str, float]
+    """Of the last step."""
+    milliseconds: float
+    """Of one gradient step, compiling aside."""
+
+
+def make_fit(belief: Belief) -> Callable[[Transition, dynamics.Normalizers, int, int], Fit]:
+    """`fit(data, normalizers, steps, seed)`: a belief after so many gradient steps on transitions `[N, ...]`. It is
+    compiled once for all transitions of one shape.
+    """
 
     @jax.jit
-    def run_steps(state: Any, first: Any, count: Any) -> tuple[Any, Any]:
+    def run_steps(key: Key, state: Any, held: Any, normalizers: Any, first: Any, count: Any) -> tuple[Any, Any]:
         def step(i: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
-            return belief.update(jax.random.fold_in(steps_key, i), carry[0], held, normalizers)
+            return belief.update(jax.random.fold_in(key, i), carry[0], held, normalizers)
 
-        metrics = jax.tree.map(jnp.zeros_like, belief.update(steps_key, state, held, normalizers)[1])
+        metrics = no_metrics(lambda: belief.update(key, state, held, normalizers)[1])
         return jax.lax.fori_loop(first, first + count, step, (state, metrics))
 
-    state = jax.jit(belief.init)(init_key)
-    state, _ = jax.block_until_ready(run_steps(state, 0, 1))
-    began = time.monotonic()
-    state, metrics = jax.block_until_ready(run_steps(state, 1, steps - 1))
-    return state, metrics, 1e3 * (time.monotonic() - began) / max(steps - 1, 1)
+    init = jax.jit(belief.init)
+
+    def fit(data: Transition, normalizers: dynamics.Normalizers, steps: int, seed: int) -> Fit:
+        held = replay.init(jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), data), len(data.obs))
+        held = replay.add(held, data)
+        init_key, key = jax.random.split(jax.random.key(seed))
+        state, _ = jax.block_until_ready(run_steps(key, init(init_key), held, normalizers, 0, 1))
+        began = time.monotonic()
+        state, metrics = jax.block_until_ready(run_steps(key, state, held, normalizers, 1, steps - 1))
+        milliseconds = 1e3 * (time.monotonic() - began) / max(steps - 1, 1)
+        return Fit(state, {name: float(value) for name, value in metrics.items()}, milliseconds)
+
+    return fit
 
 
 def normalizers_of(data: Transition) -> dynamics.Normalizers:
@@ -117,11 +134,11 @@ def verdict(name: str, method: str, config: ExplorationConfig, steps: int, seed:
     if belief.predict is None:
         raise RunError(f"--method={method} has no belief. Allowed: a method with models of the environment.")
     normalizers = normalizers_of(stored.data)
-    state, metrics, milliseconds = fit(belief, stored.data, normalizers, steps, seed)
+    state, metrics, milliseconds = make_fit(belief)(stored.data, normalizers, steps, seed)
     sample = jax.jit(belief.sample, static_argnums=2)
     models = sample(jax.random.key(seed + 1), state, belief.num_models)
     kinds = {kind: judge(belief, models, normalizers, rows) for kind, rows in stored._asdict().items()}
-    return Verdict(name, kinds, {key: float(value) for key, value in metrics.items()}, milliseconds)
+    return Verdict(name, kinds, metrics, milliseconds)
 
 
 def table(verdicts: Sequence[Verdict]) -> str:

@@ -7,7 +7,7 @@ that many are where no data are, the divergence KL(exact || belief) is taken of 
 time, where it also matters which errors go together.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +16,7 @@ import numpy as np
 
 from experiments.analysis.tables import text_table
 from jaxplore import dynamics, normalizer
+from jaxplore.beliefs.base import Belief
 from jaxplore.config import ExplorationConfig, Sizes
 from jaxplore.methods import METHODS
 from jaxplore.types import Array, Transition
@@ -92,19 +93,20 @@ def divergence(mean: np.ndarray, covariance: np.ndarray, own_mean: np.ndarray, o
 
 def divergences(method: str, config: ExplorationConfig, steps: int, seed: int) -> Divergences:
     """What the belief of a method comes to, over `FUNCTIONS` functions."""
-    found = [_one(method, config, steps, seed * FUNCTIONS + i) for i in range(FUNCTIONS)]
+    from benchmarks.beliefs import make_fit
+
+    belief = METHODS[method].signal(Sizes(1, 1), config).belief
+    fit = make_fit(belief)
+    found = [_one(belief, fit, steps, seed * FUNCTIONS + i) for i in range(FUNCTIONS)]
     return Divergences(*(float(np.mean(column)) for column in zip(*found, strict=True)))
 
 
-def _one(method: str, config: ExplorationConfig, steps: int, seed: int) -> tuple[float, float, float, float]:
-    from benchmarks.beliefs import fit
-
+def _one(belief: Belief, fit: Callable[..., Any], steps: int, seed: int) -> tuple[float, float, float, float]:
     problem = draw_problem(seed)
-    belief = METHODS[method].signal(Sizes(1, 1), config).belief
     # One input stands for the observation, the other for the action, and the value for the change.
     data = _as_transitions(problem.inputs, problem.values)
     normalizers = dynamics.Normalizers(*(normalizer.init(1) for _ in range(3)))
-    state, _, _ = fit(belief, data, normalizers, steps, seed)
+    state = fit(data, normalizers, steps, seed).state
     models = jax.jit(belief.sample, static_argnums=2)(jax.random.key(seed), state, belief.num_models)
     test = _as_transitions(problem.test, np.zeros(NUM_TEST))
     prediction: Any = jax.jit(lambda models: belief.imagine(models, normalizers, test.obs, test.action))(models)

@@ -41,6 +41,8 @@ class EnsembleConfig:
     """Weights of transitions, fixed for each member and transition from the transition's arrival on. `none`: 1
     (nnaisense/max). `poisson`: independent Poisson counts of mean 1. `multinomial`: as many copies as there are
     members, each copy given to a random member."""
+    bootstrap_std: float = 1.0
+    """Standard deviation of those weights, in (0, 1]: below 1 a member is also fitted to what it was not given."""
     num_members: int = 32
     """M, static networks; all of them are drawn for a round. Paper: 32."""
 
@@ -48,6 +50,7 @@ class EnsembleConfig:
         checks = Checks(self)
         checks.at_least("num_members", 1)
         checks.one_of("bootstrap", get_args(Bootstrap))
+        checks.in_range("bootstrap_std", 0.0, 1.0, open_low=True)
 
 
 @struct.dataclass
@@ -58,7 +61,7 @@ class EnsembleState:
     opt_state: optax.OptState
 
 
-def bootstrap_weights(kind: Bootstrap, num_members: int, index: Array) -> Array:
+def bootstrap_weights(kind: Bootstrap, num_members: int, index: Array, std: float = 1.0) -> Array:
     """The weight that each member gives to the transitions it looks at.
 
     A function of the member and of the transition's place in the replay, which it keeps as long as it is there: so
@@ -68,9 +71,10 @@ def bootstrap_weights(kind: Bootstrap, num_members: int, index: Array) -> Array:
         kind: see `EnsembleConfig.bootstrap`.
         num_members: `M`.
         index: places in the replay, int `[M, B]`; row i is of member i.
+        std: see `EnsembleConfig.bootstrap_std`.
 
     Returns:
-        `[M, B]`, whole numbers of at least 0.
+        `[M, B]`, at least 0; whole numbers where `std` is 1.
 
     Example:
         >>> import jax.numpy as jnp
@@ -78,20 +82,24 @@ def bootstrap_weights(kind: Bootstrap, num_members: int, index: Array) -> Array:
         >>> bool((bootstrap_weights("multinomial", 8, everyone).sum(axis=0) == 8).all())
         True
     """
+    return jax.vmap(partial(member_weights, kind, num_members, std=std))(jnp.arange(num_members), index)
+
+
+def member_weights(kind: Bootstrap, num_members: int, member: int | Array, index: Array, std: float = 1.0) -> Array:
+    """`bootstrap_weights` of one member of `num_members`, for places of any shape, in that shape."""
     if kind == "none":
         return jnp.ones(index.shape)
-    members = jnp.broadcast_to(jnp.arange(num_members)[:, None], index.shape)
     base = jax.random.key(_BOOTSTRAP_SEED)
 
-    def poisson(member: Array, place: Array) -> Array:
+    def poisson(place: Array) -> Array:
         uniform = jax.random.uniform(jax.random.fold_in(jax.random.fold_in(base, place), member))
         return jnp.sum(uniform >= jnp.array(_POISSON_CDF))
 
-    def multinomial(member: Array, place: Array) -> Array:
+    def multinomial(place: Array) -> Array:
         return jnp.sum(jax.random.randint(jax.random.fold_in(base, place), (num_members,), 0, num_members) == member)
 
-    weight = poisson if kind == "poisson" else multinomial
-    return jax.vmap(jax.vmap(weight))(members, index).astype(jnp.float32)
+    weights = jax.vmap(poisson if kind == "poisson" else multinomial)(index.reshape(-1))
+    return 1.0 + std * (weights.reshape(index.shape).astype(jnp.float32) - 1.0)
 
 
 def gaussian_head(last: Array) -> tuple[Array, Array]:
@@ -204,7 +212,7 @@ def update(
     rows = jax.tree.map(lambda leaf: leaf[index], data.rows)
     inputs = encoding.inputs(normalizers, rows.obs, rows.action)
     targets = encoding.targets(normalizers, rows.obs, rows.next_obs)
-    weights = bootstrap_weights(spec.config.bootstrap, num_members, index)
+    weights = bootstrap_weights(spec.config.bootstrap, num_members, index, spec.config.bootstrap_std)
     train = jax.vmap(partial(train_member, spec))
     params, opt_state, losses, errors = train(state.params, state.opt_state, inputs, targets, weights)
     metrics = {"loss": jnp.mean(losses), "squared_error": jnp.mean(errors)}

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxplore import validate
+from jaxplore.beliefs.ensemble import Bootstrap
 from jaxplore.networks import ACTIVATIONS, MLP, apply
 from jaxplore.types import Array, Key, Params
 from jaxplore.validate import Checks
@@ -52,6 +53,16 @@ class GeneratorConfig:
     num_generators: int = 1
     """K, generators of their own within one belief, each with its own features and heads, and `num_particles / K` of
     the networks. Networks of one generator err together, those of several apart. Paper: 1."""
+    bootstrap: Bootstrap = "none"
+    """Weights of transitions, fixed for each generator and transition as for a static ensemble's members; see
+    `EnsembleConfig.bootstrap`."""
+    bootstrap_std: float = 1.0
+    """Standard deviation of those weights, in (0, 1]."""
+    prior_scale: float = 0.0
+    """Standard deviation of a random function of z and the inputs that is added to each network and never trained, so
+    that networks differ where no data tell them to agree (Osband et al. 2018; linear in z as in Dwaracherla et al.
+    2020); in output units, at inputs of one standard deviation. 0: none. Features no fewer than `noise_size` can learn
+    to make up for it."""
     bias_std: float = 0.1
     """The same for entries of leaves with fewer than two axes (biases, scales), around the example's value."""
 
@@ -65,6 +76,9 @@ class GeneratorConfig:
         checks.in_range("bias_std", 0.0)
         checks.one_of("activation", ACTIVATIONS)
         checks.at_least("num_generators", 1)
+        checks.one_of("bootstrap", get_args(Bootstrap))
+        checks.in_range("bootstrap_std", 0.0, 1.0, open_low=True)
+        checks.in_range("prior_scale", 0.0)
 
 
 class Generator(NamedTuple):

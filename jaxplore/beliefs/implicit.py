@@ -10,6 +10,7 @@ import jax.numpy as jnp
 
 from jaxplore import dynamics, networks, replay, validate
 from jaxplore.beliefs.base import Belief, FitConfig, make_optimizer
+from jaxplore.beliefs.ensemble import Bootstrap, member_weights
 from jaxplore.beliefs.generator import Generator, GeneratorConfig, make_generator
 from jaxplore.beliefs.svgd import AmortizedSVGD, SVGDConfig, SVGDState, make_amortized_svgd
 from jaxplore.dynamics import ENCODINGS, DynamicsConfig, Encoding, Normalizers, Prediction
@@ -32,6 +33,8 @@ class GeneratorBelief(NamedTuple):
     svgd: SVGDConfig
     num_generators: int
     """K, each with its own state along a leading axis where there are several."""
+    bootstrap: Bootstrap
+    bootstrap_std: float
 
 
 def make_generator_belief(
@@ -80,10 +83,21 @@ def make_generator_belief(
         raise FieldError("num_generators", count, allowed, "shares the networks unequally", "GeneratorConfig")
     svgd_config = dataclasses.replace(svgd_config, num_particles=svgd_config.num_particles // count)
     apply = functools.partial(_run, network, encoding)
+    if generator_config.prior_scale:
+        generator, apply = add_prior(generator, generator_config.prior_scale, network, encoding, obs_size + action_size)
     posterior = make_amortized_svgd(generator, apply, obs_size, make_optimizer(fit_config), svgd_config)
     input_size = obs_size + action_size
     parts = GeneratorBelief(
-        generator, posterior, apply, encoding, input_size, fit_config.batch_size, svgd_config, count
+        generator,
+        posterior,
+        apply,
+        encoding,
+        input_size,
+        fit_config.batch_size,
+        svgd_config,
+        count,
+        generator_config.bootstrap,
+        generator_config.bootstrap_std,
     )
     return Belief(
         init=functools.partial(init, parts),
@@ -94,6 +108,48 @@ def make_generator_belief(
         num_models=svgd_config.num_particles * count,
         fit_config=fit_config,
     )
+
+
+def add_prior(
+    generator: Generator, scale: float, network: networks.MLP, encoding: Encoding, input_size: int
+) -> tuple[Generator, Callable[[Params, Array], Array]]:
+    """A generator whose networks have a random function added to them that is never trained; see
+    `GeneratorConfig.prior_scale`.
+
+    The function is the last layer, drawn linearly from z, of a random network with the hidden layers of `network`.
+
+    Args:
+        generator: of networks like `network`.
+        scale: standard deviation of the function's values, over z and standard normal inputs.
+        network: architecture of a dynamics network.
+        encoding: how its last layer is read.
+        input_size: `I`.
+
+    Returns:
+        `(generator, apply)`: parameters are `{"network": ..., "prior": [width, O]}`, and `apply(params, inputs [N, I])`
+        gives `[N, O]`.
+    """
+    # Fixed keys, as for the example: what is frozen follows from the settings alone.
+    features_key, map_key, inputs_key = jax.random.split(jax.random.key(1), 3)
+    features = networks.MLP(network.hidden[:-1], network.hidden[-1], network.activation, "he", "he")
+    frozen = features.init(features_key, jnp.zeros(input_size))["params"]
+
+    def features_of(inputs: Array) -> Array:
+        return networks.ACTIVATIONS[network.activation](networks.apply(features, frozen, inputs))
+
+    power = jnp.mean(jnp.sum(features_of(jax.random.normal(inputs_key, (512, input_size))) ** 2, axis=1))
+    z_size = jax.eval_shape(lambda: generator.sample_noise(map_key, 1)).size
+    shape = (z_size, network.hidden[-1], network.output_size)
+    from_z = scale / jnp.sqrt(power * z_size) * jax.random.normal(map_key, shape)
+
+    def generate(eta: Params, z: Array) -> Params:
+        return {"network": generator.generate(eta, z), "prior": jnp.tensordot(z.reshape(-1), from_z, axes=1)}
+
+    def apply(params: Params, inputs: Array) -> Array:
+        prior = features_of(inputs) @ params["prior"]
+        return encoding.outputs(networks.apply(network, params["network"], inputs) + prior)
+
+    return generator._replace(generate=generate, sample=jax.vmap(generate, in_axes=(None, 0))), apply
 
 
 def init(parts: GeneratorBelief, key: Key) -> SVGDState:
@@ -110,17 +166,27 @@ def update(
     if parts.num_generators == 1:
         return update_one(parts, key, state, data, normalizers)
     keys = jax.random.split(key, parts.num_generators)
-    one = jax.vmap(functools.partial(update_one, parts), in_axes=(0, 0, None, None))
-    state, metrics = one(keys, state, data, normalizers)
+    one = jax.vmap(functools.partial(update_one, parts), in_axes=(0, 0, None, None, 0))
+    state, metrics = one(keys, state, data, normalizers, jnp.arange(parts.num_generators))
     return state, {name: jnp.mean(values) for name, values in metrics.items()}
 
 
 def update_one(
-    parts: GeneratorBelief, key: Key, state: SVGDState, data: Replay[Transition], normalizers: Normalizers
+    parts: GeneratorBelief,
+    key: Key,
+    state: SVGDState,
+    data: Replay[Transition],
+    normalizers: Normalizers,
+    number: int | Array = 0,
 ) -> tuple[SVGDState, Metrics]:
-    """`update` of one generator."""
+    """`update` of one generator, the `number`-th."""
     batch_key, extra_key, update_key = jax.random.split(key, 3)
-    batch = replay.sample(batch_key, data, parts.batch_size)
+    own = parts.svgd.num_particles if parts.svgd.batches == "own" else 0
+    index = replay.choose(batch_key, data, max(own, 1) * parts.batch_size)
+    index = index.reshape(own, -1) if own else index
+    batch, weights = replay.take(data, index), None
+    if parts.bootstrap != "none":
+        weights = member_weights(parts.bootstrap, parts.num_generators, number, index, parts.bootstrap_std)
     inputs = parts.encoding.inputs(normalizers, batch.obs, batch.action)
     targets = parts.encoding.targets(normalizers, batch.obs, batch.next_obs)
     extra_inputs = None
@@ -128,7 +194,7 @@ def update_one(
         extra = replay.sample(extra_key, data, parts.batch_size)
         extra_inputs = parts.encoding.inputs(normalizers, extra.obs, extra.action)
     num_data = jnp.maximum(data.size, 1)
-    return parts.posterior.update(update_key, state, inputs, targets, num_data, extra_inputs)
+    return parts.posterior.update(update_key, state, inputs, targets, num_data, extra_inputs, weights)
 
 
 def sample(parts: GeneratorBelief, key: Key, state: SVGDState, num: int) -> Params:

@@ -40,6 +40,7 @@ RepulsionPoints = Literal["batch", "perturbed", "independent", "uniform"]
 Prior = Literal["flat", "weights", "gp"]
 Tempering = Literal["constant", "per_datum"]
 Redraw = Literal["every_step", "fixed"]
+Batches = Literal["shared", "own"]
 
 MIN_BANDWIDTH = 1e-6
 """Floor of the bandwidth: identical particles must not divide by zero."""
@@ -91,6 +92,10 @@ class SVGDConfig:
     """Whether points beyond the data with a flat prior pass without a warning: you watch `repulsion_variance`."""
     redraw: Redraw = "every_step"
     """`every_step`: new noise z each update. `fixed`: one set drawn at the start (needs `self_weight=1`)."""
+    batches: Batches = "shared"
+    """`shared` (paper): networks meet on one batch. `own`: one each, as static networks have, so that a step sees m
+    times the data for the same products. Nothing then compares networks, as no two are at the same points: each follows
+    its own score alone, without kernel, repulsion or `prior="gp"`, and they differ by z and by `num_generators`."""
 
     def __post_init__(self) -> None:
         checks = Checks(self)
@@ -104,6 +109,7 @@ class SVGDConfig:
             ("tempering", Tempering),
             ("repulsion_points", RepulsionPoints),
             ("redraw", Redraw),
+            ("batches", Batches),
         ):
             checks.one_of(field, get_args(names))
         positive = ("bandwidth_scale", "likelihood_std", "temperature", "prior_scale", "prior_bias_std")
@@ -113,6 +119,9 @@ class SVGDConfig:
         if self.redraw == "fixed" and self.self_weight < 1.0:
             problem = "diverges with redraw='fixed': a particle that is not pulled itself is pushed without end"
             raise checks.refusal("self_weight", problem, "self_weight=1, or redraw='every_step'")
+        if self.batches == "own" and (self.prior == "gp" or self.repulsion_points != "batch"):
+            problem = "leaves networks no points in common, to be pushed apart on or to have a prior at"
+            raise checks.refusal("batches", problem, "'shared', or repulsion_points='batch' with another prior")
 
 
 class SteinDirection(NamedTuple):
@@ -243,7 +252,8 @@ class AmortizedSVGD(NamedTuple):
     init: Callable[[Key], SVGDState]
     """`init(key) -> state`."""
     update: Callable[..., tuple[SVGDState, Metrics]]
-    """`update(key, state, inputs [B, I], targets [B, O], num_data, extra_inputs=None) -> (state, metrics)`, jitted."""
+    """`update(key, state, inputs [B, I], targets [B, O], num_data, extra_inputs=None, weights=None)`, jitted, gives
+    `(state, metrics)`; inputs and targets are `[M, B, ...]` where `batches="own"`."""
 
 
 class SVGDSpec(NamedTuple):
@@ -296,6 +306,11 @@ def further_points(spec: SVGDSpec, key: Key, inputs: Array, extra_inputs: Array 
 
 
 def _check_batch(spec: SVGDSpec, inputs: Array, targets: Array, extra_inputs: Array | None) -> None:
+    if spec.config.batches == "own":
+        num = spec.config.num_particles
+        validate.shape("inputs", inputs, num, "B", "I")
+        validate.shape("targets", targets, num, jnp.shape(inputs)[1], spec.num_outputs)
+        return
     shapes = {"inputs": jnp.shape(inputs), "targets": jnp.shape(targets)}
     if len(shapes["inputs"]) != 2 or not shapes["inputs"][0]:
         raise FieldError("inputs", shapes["inputs"], "shape [B, I] with B of 1 or more", "is their shape")
@@ -315,6 +330,7 @@ def update(
     targets: Array,
     num_data: int | Array,
     extra_inputs: Array | None = None,
+    weights: Array | None = None,
 ) -> tuple[SVGDState, Metrics]:
     """Draw m networks and move eta once; see `AmortizedSVGD.update` and `make_amortized_svgd`.
 
@@ -322,10 +338,11 @@ def update(
         spec: the fixed parts.
         key: consumed.
         state: before the update.
-        inputs: the batch, `[B, I]`.
-        targets: `[B, O]`.
+        inputs: the batch, `[B, I]`; one for each network, `[M, B, I]`, where `batches="own"`.
+        targets: `[B, O]`, or `[M, B, O]`.
         num_data: N, of which the batch is a part.
         extra_inputs: a second batch `[B, I]`, for `repulsion_points="independent"`.
+        weights: how much each datum of the batch counts, `[B]` or `[M, B]`, of mean 1; by default all count 1.
 
     Returns:
         `(state, metrics)`.
@@ -337,6 +354,8 @@ def update(
     _check_batch(spec, inputs, targets, extra_inputs)
     noise_key, points_key = jax.random.split(key)
     z = state.z if config.redraw == "fixed" else generator.sample_noise(noise_key, config.num_particles)
+    if config.batches == "own":
+        return _update_apart(spec, state, z, inputs, targets, num_data, weights)
     batch_size = inputs.shape[0]
     further = further_points(spec, points_key, inputs, extra_inputs)
     all_inputs = inputs if further is None else jnp.concatenate([inputs, further])
@@ -350,6 +369,7 @@ def update(
     temperature = config.temperature * (num_data if config.tempering == "per_datum" else 1.0)
     residuals = targets[None] - values[:, :batch_size]
     scores = num_data / batch_size / temperature * residuals / state.likelihood_var[None, None]
+    scores = scores if weights is None else weights[None, :, None] * scores
     direction = stein_direction(scores, repulsion_values, config)
 
     repulsion = direction.repulsion
@@ -375,6 +395,44 @@ def update(
         "repulsion_variance": jnp.mean(jnp.var(repulsion_values, axis=0)),
         "bandwidth": direction.bandwidth,
         "kernel_mean": direction.kernel_mean,
+        "likelihood_std": jnp.mean(jnp.sqrt(likelihood_var)),
+        "gradient_norm": optax.tree.norm(gradient),
+    }
+    if generator.features is not None:
+        metrics["dead_features"] = dead_share(generator.features(state.eta, z))
+    eta = optax.apply_updates(state.eta, steps)
+    return SVGDState(eta=eta, opt_state=opt_state, likelihood_var=likelihood_var, z=z), metrics
+
+
+def _update_apart(
+    spec: SVGDSpec,
+    state: SVGDState,
+    z: Array,
+    inputs: Array,
+    targets: Array,
+    num_data: int | Array,
+    weights: Array | None,
+) -> tuple[SVGDState, Metrics]:
+    """`update` where each network of noise `z` follows its own score on a batch of its own, `[M, B, ...]`."""
+    config, generator = spec.config, spec.generator
+    thetas, to_eta = jax.vjp(lambda eta: generator.sample(eta, z), state.eta)
+    values, to_theta = jax.vjp(lambda thetas: jax.vmap(spec.apply)(thetas, inputs), thetas)
+    residuals = targets - values
+    scores = residuals / state.likelihood_var[None, None]
+    (theta_move,) = to_theta(scores if weights is None else weights[..., None] * scores)
+    if config.prior == "weights":
+        # Beside the data's mean the prior counts T / N, or T where T is for one datum.
+        weight = inputs.shape[1] * config.temperature / (1.0 if config.tempering == "per_datum" else num_data)
+        prior_move = _weight_prior_move(thetas, jnp.eye(config.num_particles), config)
+        theta_move = jax.tree.map(lambda move, prior: move + weight * prior, theta_move, prior_move)
+    (eta_move,) = to_eta(theta_move)
+    gradient = jax.tree.map(lambda move: -move / (config.num_particles * inputs.shape[1]), eta_move)
+    steps, opt_state = spec.optimizer.update(gradient, state.opt_state, state.eta)
+    likelihood_var = state.likelihood_var
+    if config.learn_likelihood_std:
+        likelihood_var = _follow_residuals(likelihood_var, residuals, config)
+    metrics = {
+        "loss": jnp.mean(residuals**2),
         "likelihood_std": jnp.mean(jnp.sqrt(likelihood_var)),
         "gradient_norm": optax.tree.norm(gradient),
     }
@@ -439,7 +497,8 @@ def make_amortized_svgd(
         `AmortizedSVGD(init, update)`. `update` draws m networks, moves eta once, and reports `loss` (mean squared
         error per output), `variance` (of the networks' predictions on the batch, mean over points and outputs),
         `repulsion_variance` (the same at the repulsion points: watch it for growth), `bandwidth`, `kernel_mean`,
-        `likelihood_std` and `gradient_norm`.
+        `likelihood_std` and `gradient_norm`. With `batches="own"` there is nothing to compare networks on: it reports
+        `loss`, `likelihood_std` and `gradient_norm`.
 
     Warns:
         UserWarning: points beyond the data with a flat prior: no posterior exists there, the variance keeps growing.
@@ -477,10 +536,11 @@ def make_amortized_svgd(
         targets: Array,
         num_data: int | Array,
         extra_inputs: Array | None = None,
+        weights: Array | None = None,
     ) -> tuple[SVGDState, Metrics]:
         # Here, where it may still be known: within the program it is not.
         if validate.known(num_data) and not np.all(np.asarray(num_data) > 0):
             raise FieldError("num_data", num_data, "1 or more, the data that the batch is a part of", "is out of range")
-        return jitted(key, state, inputs, targets, num_data, extra_inputs)
+        return jitted(key, state, inputs, targets, num_data, extra_inputs, weights)
 
     return AmortizedSVGD(init=partial(init, spec), update=checked_update)

@@ -64,7 +64,7 @@ def test_a_kind_is_judged_by_hand():
     assert found.rank == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("name", ["ant_maze", "acrobot"])
+@pytest.mark.parametrize("name", ["ant_maze", "acrobot", "half_cheetah"])
 def test_what_is_stored_is_three_kinds_of_one_environment(name: str):
     stored = transitions.load(name)
     assert name in transitions.names()

@@ -9,6 +9,7 @@ import pytest
 
 from jaxplore import dynamics, replay
 from jaxplore.beliefs import FitConfig, GeneratorConfig, SVGDConfig, make_generator_belief
+from jaxplore.beliefs.ensemble import bootstrap_weights
 from jaxplore.types import Transition
 
 OBS, ACTION, M, K = 3, 2, 8, 4
@@ -67,6 +68,24 @@ def test_networks_are_as_many_from_each():
         belief.sample(key, state, 6)
 
 
+def test_each_resamples_the_data_as_a_member_would(data):
+    # a generator moves once a transition is held that it gives a weight above 0, and not before
+    generator = dataclasses.replace(GENERATOR, bootstrap="poisson")
+    svgd = SVGDConfig(num_particles=M, batches="own")
+    belief = make_generator_belief(OBS, ACTION, NETWORK, generator, svgd, dataclasses.replace(FIT, weight_decay=0.0))
+    state, update = jax.jit(belief.init)(jax.random.key(0)), jax.jit(belief.update)
+    held, normalizers = data
+    weights = np.asarray(bootstrap_weights("poisson", K, jnp.tile(jnp.arange(3)[None], (K, 1))))
+    seen = set()
+    for size in (1, 2, 3):
+        after, _ = update(jax.random.key(1), state, held.replace(size=jnp.int32(size)), normalizers)
+        pairs = zip(jax.tree.leaves(after.eta), jax.tree.leaves(state.eta), strict=True)
+        moved = np.any([np.any(np.asarray(a != b).reshape(K, -1), axis=1) for a, b in pairs], axis=0)
+        np.testing.assert_array_equal(moved, np.any(weights[:, :size] > 0, axis=1))
+        seen |= set(moved)
+    assert seen == {True, False}
+
+
 def test_a_number_that_does_not_divide_is_refused():
     expected = r"GeneratorConfig\.num_generators=3 shares the networks unequally\. Allowed: a divisor of svgd\.num_part"
     with pytest.raises(ValueError, match=expected):
@@ -75,3 +94,5 @@ def test_a_number_that_does_not_divide_is_refused():
         GeneratorConfig(num_generators=0)
     with pytest.raises(ValueError, match=r"GeneratorConfig\.activation='tanhh' .*Did you mean 'tanh'"):
         GeneratorConfig(activation="tanhh")
+    with pytest.raises(ValueError, match=r"GeneratorConfig\.bootstrap='poison' .*Did you mean 'poisson'"):
+        GeneratorConfig(bootstrap="poison")  # pyright: ignore[reportArgumentType]

@@ -315,6 +315,44 @@ def test_weight_prior_adds_its_kernel_averaged_score(x64):
     np.testing.assert_allclose(with_prior - flat, want, rtol=1e-6, atol=1e-12)
 
 
+@pytest.mark.parametrize("tempering", ["constant", "per_datum"])
+def test_with_batches_of_their_own_networks_follow_their_own_scores(x64, tempering):
+    # the gradient of the mean over networks and batch of w (y - f)^2 / (2 sigma^2), by complex steps, less that of the
+    # weight prior over N data, or over one where T is for one
+    m, n, total, temperature, std = 3, 4, 40, 2.5, 0.3
+    rng = np.random.default_rng(0)
+    x, y, weights = rng.normal(size=(m, n)), rng.normal(size=(m, n)), rng.integers(0, 3, size=(m, n)).astype(float)
+    settings = {"batches": "own", "likelihood_std": std, "temperature": temperature, "tempering": tempering}
+    for prior in ("flat", "weights"):
+        config = SVGDConfig(num_particles=m, prior=prior, prior_bias_std=0.5, **settings)
+        posterior = make_amortized_svgd(TINY, tiny_apply, 1, optax.sgd(1.0), config)
+        state = jax.jit(posterior.init)(jax.random.key(0))
+        given = x[..., None], y[..., None], total, None, weights
+        new, metrics = jax.jit(posterior.update)(jax.random.key(1), state, *given)
+        eta, after = (np.concatenate([np.ravel(one.eta["w"]), one.eta["b"]]) for one in (state, new))
+        zs, want = np.asarray(new.z), np.zeros(6)
+        residuals = np.zeros((m, n))
+        for i in range(m):
+            residuals[i] = y[i] - tiny_values(eta, zs[i : i + 1], x[i])[0]
+            want += tiny_move(eta, zs[i : i + 1], x[i], (weights[i] * residuals[i])[None] / std**2) / (m * n)
+        if prior == "weights":
+            move = -(zs @ eta[:4].reshape(2, 2).T + eta[4:]) / 0.5**2
+            flat = np.concatenate([np.ravel(np.einsum("mi,mj->ij", move, zs)), move.sum(axis=0)])
+            want += temperature / m / (1 if tempering == "per_datum" else total) * flat
+        np.testing.assert_allclose(after - eta, want, rtol=1e-6, atol=1e-12)
+        assert float(metrics["loss"]) == pytest.approx(np.mean(residuals**2), rel=1e-6)
+
+
+def test_weights_scale_the_scores_of_a_shared_batch(x64):
+    # data that count twice, once and not at all are those in a batch with the first one doubled, but for N / n
+    x, y = np.array([0.5, -1.0, 2.0]), np.array([1.0, 0.3, -0.4])
+    posterior = make_amortized_svgd(TINY, tiny_apply, 1, optax.sgd(1.0), SVGDConfig(num_particles=1))
+    state, update = jax.jit(posterior.init)(jax.random.key(0)), jax.jit(posterior.update)
+    weighted, _ = update(jax.random.key(1), state, x[:, None], y[:, None], 3, None, np.array([2.0, 1.0, 0.0]))
+    doubled, _ = update(jax.random.key(1), state, x[[0, 0, 1], None], y[[0, 0, 1], None], 3)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), weighted.eta, doubled.eta)
+
+
 def test_gp_prior_adds_its_kernel_averaged_score(x64):
     # -K^-1 f with K = a^2 exp(-d^2 / (2 l^2)) + 1e-4 a^2 I, solved by NumPy
     m, n, amplitude, scale = 4, 6, 2.0, 0.4
@@ -401,6 +439,12 @@ def test_guards():
         SVGDConfig(likelihood_std=0.0)
     with pytest.raises(ValueError, match=r"SVGDConfig\.num_particles=0"):
         SVGDConfig(num_particles=0)
+    with pytest.raises(
+        ValueError, match=r"batches='own' leaves networks no points in common.*repulsion_points='batch'"
+    ):
+        SVGDConfig(batches="own", repulsion_points="perturbed")
+    with pytest.raises(ValueError, match=r"batches='own' leaves networks no points in common"):
+        SVGDConfig(batches="own", prior="gp")
     for points in ("perturbed", "uniform"):
         with pytest.warns(UserWarning, match="variance grows without bound"):
             make_amortized_svgd(TINY, tiny_apply, 1, optax.sgd(1.0), SVGDConfig(repulsion_points=points))
