@@ -132,6 +132,15 @@ def test_variance_of_a_linear_regression(x64, settings, want, tolerance):
         np.testing.assert_array_less(errors, 0.06)
 
 
+@pytest.mark.parametrize(("num", "want", "tolerance"), [(4, 1.26, 0.1), (8, 1.08, 0.05), (16, 1.0, 0.03)])
+def test_few_particles_without_their_own_score_are_too_wide(x64, num, want, tolerance):
+    # with l = 0 the exact posterior is stationary as m grows; 4 measured as 1.24 by an independent prototype
+    x, y = regression(60, 3)
+    config = SVGDConfig(self_weight=0.0, likelihood_std=0.2, num_particles=num)
+    covariances = fit(config, x, y, steps=1500)[0]
+    assert ratio(covariances, exact_covariance(x, 0.2)) == pytest.approx(want, abs=tolerance)
+
+
 def test_mean_of_squared_errors_is_a_temperature_of_n(x64):
     # T9: tempering="per_datum" makes the data term a mean over N = 60 points: 60 times the posterior variance
     x, y = regression(60, 3)
