@@ -13,8 +13,8 @@ With residuals y - F of a batch of n out of N points, likelihood standard deviat
 where R are the predictions at the repulsion points and l is the weight of a particle in its own average. l = 1 is
 the paper's equation 6, and its variance is too small by a known factor (`experiments/results/README.md`, "What the
 update converges to"). With l = 0 and noise redrawn at every step the exact posterior is stationary as m grows: the
-variance is within 1 % of it from m = 16 on, 1.08 times it with 8, 1.3 with 4, and grows without end with 2, as it does with any m
-where a flat prior and few data leave networks free.
+variance is within 1 % of it from m = 16 on, 1.08 times it with 8, 1.3 with 4, and grows without end with 2, as it does
+with any m where a flat prior and few data leave networks free.
 """
 
 import math
