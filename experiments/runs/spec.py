@@ -15,7 +15,7 @@ from experiments.runs.presets import preset_config
 from jaxplore.methods import METHODS
 from jaxplore.validate import FieldError
 
-FORMAT = 3
+FORMAT = 4
 """Of what `config.json` holds. Files without a format are of the first, 0."""
 
 WITHOUT_EFFECT = ("preset", "checkpoint_every", "eval_every", "eval_episodes")

@@ -4,9 +4,11 @@ Format 0, until November 2026: m stood twice (`imagination.num_models` beside `s
 networks alone), and `imagination` also configured methods that imagine nothing.
 Format 1, of that month: a belief had one generator, and its features were ReLU's.
 Format 2, of that month: what a policy had imagined stayed as long as the policy lived.
+Format 3, of that month: a generator's networks met on one batch, all data counted alike, and nothing was added to them.
 """
 
 import copy
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -23,6 +25,13 @@ MOVED = {
 OLD_GENERATOR = {"noise_size", "hidden", "noise", "init_std", "constant_fraction", "bias_std"}
 """Fields of a generator before format 2."""
 
+
+UNTIL_FORMAT_4: dict[str, dict[str, Any]] = {
+    "generator": {"bootstrap": "none", "bootstrap_std": 1.0, "prior_scale": 0.0},
+    "svgd": {"batches": "shared"},
+    "ensemble": {"bootstrap_std": 1.0},
+}
+"""Group of the explorer -> settings that it did not have before format 4, as they then were."""
 
 OLD_IMAGINATION = {"num_actors", "horizon", "num_rollouts", "replay_capacity", "restart_every", "act_greedily"}
 """Fields of imagination that a whole one had before format 3."""
@@ -48,6 +57,8 @@ def upgrade(data: Mapping[str, Any], start: RunConfig, found: int) -> dict[str, 
     imagination = explorer.get("imagination", {})
     if found < 3 and isinstance(imagination, dict) and imagination.keys() >= OLD_IMAGINATION:
         imagination.setdefault("keep_imagined", True)
+    if found < 4:
+        _upgrade_beliefs(explorer, start)
     if found > 0:
         return data
     if isinstance(imagination, dict):
@@ -62,6 +73,16 @@ def _upgrade_generator(explorer: dict[str, Any]) -> None:
     # One that a person has written names some of its fields, and leaves the rest to the preset.
     if isinstance(generator, dict) and generator.keys() >= OLD_GENERATOR:
         explorer["generator"] = {"activation": "relu", "normalize": False, "num_generators": 1, **generator}
+
+
+def _upgrade_beliefs(explorer: dict[str, Any], start: RunConfig) -> None:
+    """Beliefs had no more than this, whatever a preset has now."""
+    for group, then in UNTIL_FORMAT_4.items():
+        fields = {field.name for field in dataclasses.fields(getattr(start.explorer, group))}
+        own = explorer.get(group)
+        # As for the generator's features: one that a person has written leaves fields to the preset.
+        if isinstance(own, dict) and own.keys() >= fields - then.keys():
+            explorer[group] = {**then, **own}
 
 
 def _upgrade_models(explorer: dict[str, Any], imagination: dict[str, Any], start: RunConfig) -> None:

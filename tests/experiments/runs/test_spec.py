@@ -3,10 +3,11 @@ import json
 
 import pytest
 
-from experiments.runs import spec
+from experiments.runs import spec, upgrades
 from experiments.runs.config import PRESETS, RunConfig, differences, flag, replace
 from experiments.runs.presets import preset_config
 from experiments.runs.spec import RunSpec
+from experiments.runs.upgrades import UNTIL_FORMAT_4
 from jaxplore.validate import FieldError
 
 # Table "List of SAC hyper-parameters", the appendix on dynamic models, and what nnaisense/max's defaults settle.
@@ -220,11 +221,30 @@ def test_a_saved_configuration_names_every_field():
 
     saved = json.loads(to_json(RunConfig()))
     assert (
-        {saved.pop("format"), saved.pop("parent")} == {3, None}
+        {saved.pop("format"), saved.pop("parent")} == {4, None}
         and saved.pop("imports") == []
         and len(saved.pop("identity")) == 16
     )
     assert keys(saved) == paths(RunConfig())
+
+
+def test_a_belief_of_before_format_4_is_what_it_was():
+    # whatever a preset has by now; a file that leaves fields out leaves them to the preset
+    saved = json.loads(spec.to_json(RunSpec(RunConfig())))
+    saved["format"] = 3
+    for group, then in UNTIL_FORMAT_4.items():
+        for name in then:
+            del saved["explorer"][group][name]
+    start = replace(
+        preset_config("laptop"),
+        {"explorer": {"generator": {"bootstrap": "poisson", "prior_scale": 1.0}, "ensemble": {"bootstrap_std": 0.5}}},
+    )
+    found = upgrades.upgrade(saved, start, 3)["explorer"]
+    for group, then in UNTIL_FORMAT_4.items():
+        assert {name: found[group][name] for name in then} == then
+    assert upgrades.upgrade({"explorer": {"svgd": {"num_particles": 8}}}, start, 3)["explorer"]["svgd"] == {
+        "num_particles": 8
+    }
 
 
 def test_a_generator_of_before_there_were_settings_for_it_is_what_it_was():
