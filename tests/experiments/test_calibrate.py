@@ -213,7 +213,9 @@ def test_ctrl_c_gives_a_line(finished, tmp_path: Path):
     process.send_signal(signal.SIGINT)
     _, stderr = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert stderr.strip() == "Stopped."
+    # Above it how far the next run is, on a machine slow enough for that to be said.
+    assert stderr.strip().splitlines()[-1] == "Stopped."
+    assert "Traceback" not in stderr
     assert not (runs[-1] / "calibration.json").exists()
 
 
