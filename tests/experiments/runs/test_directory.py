@@ -179,7 +179,7 @@ def test_every_kept_run_reads(path: Path):
         old[name] for name in ("env", "method", "seed", "steps")
     )
     if "format" in old:
-        was = {group: {**old["explorer"][group], **then} for group, then in UNTIL_FORMAT_4.items()}
+        was = {group: {**then, **old["explorer"][group]} for group, then in UNTIL_FORMAT_4.items()}
         assert json.loads(json.dumps(dataclasses.asdict(config.explorer))) == {**old["explorer"], **was}
     else:
         check_first_format(config.explorer, old["explorer"])
