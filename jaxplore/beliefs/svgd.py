@@ -387,23 +387,14 @@ def update(
         theta_move = jax.tree.map(jnp.add, theta_move, _weight_prior_move(thetas, direction.weights, config))
     (eta_move,) = to_eta(theta_move)
     gradient = jax.tree.map(lambda move: -temperature / (config.num_particles * num_data) * move, eta_move)
-    steps, opt_state = spec.optimizer.update(gradient, state.opt_state, state.eta)
-    likelihood_var = state.likelihood_var
-    if config.learn_likelihood_std:
-        likelihood_var = _follow_residuals(likelihood_var, residuals, config)
-    metrics = {
-        "loss": jnp.mean(residuals**2),
+    after, metrics = _step(spec, state, z, gradient, residuals)
+    return after, {
+        **metrics,
         "variance": jnp.mean(jnp.var(values[:, :batch_size], axis=0)),
         "repulsion_variance": jnp.mean(jnp.var(repulsion_values, axis=0)),
         "bandwidth": direction.bandwidth,
         "kernel_mean": direction.kernel_mean,
-        "likelihood_std": jnp.mean(jnp.sqrt(likelihood_var)),
-        "gradient_norm": optax.tree.norm(gradient),
     }
-    if generator.features is not None:
-        metrics["dead_features"] = dead_share(generator.features(state.eta, z))
-    eta = optax.apply_updates(state.eta, steps)
-    return SVGDState(eta=eta, opt_state=opt_state, likelihood_var=likelihood_var, z=z), metrics
 
 
 def _update_apart(
@@ -416,8 +407,8 @@ def _update_apart(
     weights: Array | None,
 ) -> tuple[SVGDState, Metrics]:
     """`update` where each network of noise `z` follows its own score on a batch of its own, `[M, B, ...]`."""
-    config, generator = spec.config, spec.generator
-    thetas, to_eta = jax.vjp(lambda eta: generator.sample(eta, z), state.eta)
+    config = spec.config
+    thetas, to_eta = jax.vjp(lambda eta: spec.generator.sample(eta, z), state.eta)
     values, to_theta = jax.vjp(lambda thetas: jax.vmap(spec.apply)(thetas, inputs), thetas)
     residuals = targets - values
     scores = residuals / state.likelihood_var[None, None]
@@ -429,6 +420,14 @@ def _update_apart(
         theta_move = jax.tree.map(lambda move, prior: move + weight * prior, theta_move, prior_move)
     (eta_move,) = to_eta(theta_move)
     gradient = jax.tree.map(lambda move: -move / (config.num_particles * inputs.shape[1]), eta_move)
+    return _step(spec, state, z, gradient, residuals)
+
+
+def _step(spec: SVGDSpec, state: SVGDState, z: Array, gradient: Params, residuals: Array) -> tuple[SVGDState, Metrics]:
+    """Eta's step down `gradient`, where networks of noise `z` missed targets by `residuals [M, B, O]`, and what every
+    update reports.
+    """
+    config, generator = spec.config, spec.generator
     steps, opt_state = spec.optimizer.update(gradient, state.opt_state, state.eta)
     likelihood_var = state.likelihood_var
     if config.learn_likelihood_std:
