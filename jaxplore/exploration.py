@@ -246,17 +246,17 @@ def assess(agent: Agent, key: Key, state: ExplorerState, transitions: Transition
     rows = jax.tree.map(lambda leaf: leaf[order], transitions)
     counts = jnp.arange(valid.shape[0]) < count
     models = belief.sample(key, state.belief, belief.num_models)
+    seen = signal.see(models, state.normalizers, rows)
     of_each = {}
     if agent.behaviour.score:
         of_each["intrinsic_reward"] = agent.behaviour.score(state.behaviour, state.normalizers, rows)
     elif signal.score:
-        of_each["intrinsic_reward"] = signal.judge(models, state.signal, state.normalizers, rows)
+        of_each["intrinsic_reward"] = signal.score(state.signal, seen)
     if belief.predict is None:
         return _spreads(of_each, counts)
-    prediction, delta = belief.judge(models, state.normalizers, rows)
-    of_each["variance"] = rewards.variance(prediction)
-    of_each["divergence"] = agent.divergence(prediction, delta, state.normalizers)
-    errors = jnp.mean((jnp.mean(prediction.mean, axis=0) - delta) ** 2, axis=-1)
+    of_each["variance"] = rewards.variance(seen.prediction)
+    of_each["divergence"] = agent.divergence(seen.prediction, seen.delta, state.normalizers)
+    errors = jnp.mean((jnp.mean(seen.prediction.mean, axis=0) - seen.delta) ** 2, axis=-1)
     return {**_spreads(of_each, counts), "model_error": jnp.nanmean(jnp.where(counts, errors, jnp.nan))}
 
 

@@ -70,11 +70,15 @@ class Signal(NamedTuple):
     learning: Learning | None = None
     """What `fit` does, in steps. None: a behaviour cannot take that over."""
 
+    def see(self, models: Any, normalizers: Normalizers, transitions: Transition) -> Seen:
+        """Real transitions `[N, ...]`, and what models drawn from the belief say of them."""
+        predicted = self.belief.judge(models, normalizers, transitions) if self.belief.predict else (None, None)
+        return Seen(transitions, *predicted, normalizers)
+
     def judge(self, models: Any, own: Any, normalizers: Normalizers, transitions: Transition) -> Array:
         """What real transitions `[N, ...]` are worth, `[N]`, by models drawn from the belief."""
         assert self.score is not None
-        predicted = self.belief.judge(models, normalizers, transitions) if self.belief.predict else (None, None)
-        return self.score(own, Seen(transitions, *predicted, normalizers))
+        return self.score(own, self.see(models, normalizers, transitions))
 
 
 def make_belief_signal(belief: Belief, reward: Reward) -> Signal:
