@@ -25,7 +25,6 @@ MOVED = {
 OLD_GENERATOR = {"noise_size", "hidden", "noise", "init_std", "constant_fraction", "bias_std"}
 """Fields of a generator before format 2."""
 
-
 UNTIL_FORMAT_4: dict[str, dict[str, Any]] = {
     "generator": {"bootstrap": "none", "bootstrap_std": 1.0, "prior_scale": 0.0},
     "svgd": {"batches": "shared"},
@@ -53,36 +52,30 @@ def upgrade(data: Mapping[str, Any], start: RunConfig, found: int) -> dict[str, 
     if not isinstance(explorer, dict):
         return data
     if found < 2:
-        _upgrade_generator(explorer)
-    imagination = explorer.get("imagination", {})
-    if found < 3 and isinstance(imagination, dict) and imagination.keys() >= OLD_IMAGINATION:
-        imagination.setdefault("keep_imagined", True)
+        then = {"activation": "relu", "normalize": False, "num_generators": 1}
+        _as_they_were(explorer, "generator", OLD_GENERATOR, then)
+    if found < 3:
+        _as_they_were(explorer, "imagination", OLD_IMAGINATION, {"keep_imagined": True})
     if found < 4:
-        _upgrade_beliefs(explorer, start)
+        for group, then in UNTIL_FORMAT_4.items():
+            fields = {field.name for field in dataclasses.fields(getattr(start.explorer, group))}
+            _as_they_were(explorer, group, fields - then.keys(), then)
     if found > 0:
         return data
+    imagination = explorer.get("imagination", {})
     if isinstance(imagination, dict):
         _upgrade_models(explorer, imagination, start)
         _upgrade_reactive(explorer, imagination, start)
     return data
 
 
-def _upgrade_generator(explorer: dict[str, Any]) -> None:
-    """There was one generator, of ReLU features as they came, whatever a preset has now."""
-    generator = explorer.get("generator")
-    # One that a person has written names some of its fields, and leaves the rest to the preset.
-    if isinstance(generator, dict) and generator.keys() >= OLD_GENERATOR:
-        explorer["generator"] = {"activation": "relu", "normalize": False, "num_generators": 1, **generator}
-
-
-def _upgrade_beliefs(explorer: dict[str, Any], start: RunConfig) -> None:
-    """Beliefs had no more than this, whatever a preset has now."""
-    for group, then in UNTIL_FORMAT_4.items():
-        fields = {field.name for field in dataclasses.fields(getattr(start.explorer, group))}
-        own = explorer.get(group)
-        # As for the generator's features: one that a person has written leaves fields to the preset.
-        if isinstance(own, dict) and own.keys() >= fields - then.keys():
-            explorer[group] = {**then, **own}
+def _as_they_were(explorer: dict[str, Any], group: str, whole: set[str], then: dict[str, Any]) -> None:
+    """Settings that a group did not have yet, as they `then` were, whatever a preset has now. A group without all of
+    its `whole` fields was written by a person, who leaves the rest to the preset.
+    """
+    own = explorer.get(group)
+    if isinstance(own, dict) and own.keys() >= whole:
+        explorer[group] = {**then, **own}
 
 
 def _upgrade_models(explorer: dict[str, Any], imagination: dict[str, Any], start: RunConfig) -> None:
