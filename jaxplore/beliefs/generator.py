@@ -226,8 +226,8 @@ def generate(spec: GeneratorSpec, eta: Params, z: Array) -> Params:
     for number, (name, indices) in enumerate(spec.layers.items()):
         own_z = z if spec.config.noise == "shared" else z[number]
         inputs = jnp.append(features_of(spec, eta[name]["features"], own_z), 1.0)
-        # Under `vmap` the product by 1 puts a network's inputs into a column. So do their gradients come out, and XLA
-        # then runs a product of two long and thin matrices the quick way round: 60 us in place of 120 for 8 networks.
+        # Under `vmap` the product by 1 puts a network's inputs into a column, where their gradients come out, too: with
+        # one generator XLA then runs that product of long and thin matrices the quick way round (paper's step: -12 %).
         inputs = jnp.eye(inputs.size) @ inputs
         for i in indices:
             generated[i] = jnp.einsum("wn,w->n", eta[name][str(i)], inputs).reshape(spec.shapes[i])
