@@ -33,6 +33,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="directory for the pictures and comparison.json")
     parser.add_argument("--until", type=int, help="compare the first so many steps of each run (default: all)")
     parser.add_argument(
+        "--against", metavar="NAME", help="what all others are compared with, seed by seed (default: the first name)"
+    )
+    parser.add_argument(
         "--keep", type=Path, help="also copy what a comparison needs of each run to this directory; they are runs, too"
     )
     modules.add_flag(parser)
@@ -44,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         modules.load(arguments.imports)
         pairs = map(split_name, arguments.runs)
         names, runs = zip(*((name, run) for name, path in pairs for run in expand(path)), strict=True)
-        text = comparison.write(runs, names, arguments.out, arguments.until)
+        text = comparison.write(runs, names, arguments.out, arguments.until, arguments.against)
         if arguments.keep:
             try:
                 for run in runs:

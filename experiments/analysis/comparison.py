@@ -9,21 +9,45 @@ import numpy as np
 
 from experiments.analysis import figures
 from experiments.analysis.calibration import DATA, HELD_OUT, UNSEEN
-from experiments.analysis.statistics import MEASURES, Group, group, interval
+from experiments.analysis.intervals import (
+    Bounds,
+    bootstrap,
+    interquartile_mean,
+    interval,
+    paired,
+    probability_of_improvement,
+)
+from experiments.analysis.statistics import MEASURES, Group, group
 from experiments.analysis.tables import duration, markdown_table, number
 from experiments.runs.errors import disk_error
 from experiments.runs.files import write_text
 from experiments.runs.scene import Cells, Scene
+from jaxplore import validate
 
 
-def write(runs: Sequence[Path], names: Sequence[str | None], out: Path, until: int | None = None) -> str:
+def write(
+    runs: Sequence[Path],
+    names: Sequence[str | None],
+    out: Path,
+    until: int | None = None,
+    against: str | None = None,
+) -> str:
     """Compare runs: pictures and `comparison.json` in `out`; gives the tables.
+
+    Args:
+        runs: directories.
+        names: of each run, what it counts under; None: its method.
+        out: a directory.
+        until: steps to compare; None: all.
+        against: the name that all others are compared with, seed by seed; None: the first.
 
     Raises:
         RunError: a run cannot be read or does not go with the others, or `out` cannot be written.
-        ValueError: the configuration of a run is damaged.
+        ValueError: the configuration of a run is damaged, or no run is called `against`.
     """
     first, groups = group(runs, until, names)
+    against = groups[0].label if against is None else against
+    validate.one_of("against", against, [one.label for one in groups])
     config, scene = first.config, first.scene
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -33,7 +57,12 @@ def write(runs: Sequence[Path], names: Sequence[str | None], out: Path, until: i
         write_text(out / "comparison.json", json.dumps(record, indent=2) + "\n")
     except OSError as error:
         raise disk_error("write the comparison", out, error) from error
-    tables = [coverage_table(groups, scene.coverage), belief_table(groups), calibration_table(groups)]
+    tables = [
+        coverage_table(groups, scene.coverage),
+        paired_table(groups, against),
+        belief_table(groups),
+        calibration_table(groups),
+    ]
     total = sum(outcome.minutes for one in groups for outcome in one.outcomes)
     after = f"{duration(60 * total)} of wall time in all; written to {out}"
     return "\n\n".join([*(text for text in tables if text), after])
@@ -69,6 +98,34 @@ def coverage_table(groups: Sequence[Group], cells_of: Cells) -> str:
             )
         )
     return markdown_table(head, lines)
+
+
+def paired_table(groups: Sequence[Group], against: str) -> str | None:
+    """A Markdown table of each method against one of them, by the mean height of the coverage curve: the difference on
+    the seeds that both have, and over all seeds how often the method's is higher; None where nothing can be compared.
+    """
+    reference = next(one for one in groups if one.label == against)
+    seeds_ahead = f"seeds ahead of `{against}`"
+    head = ("method", "coverage: interquartile mean, 95 %", f"less `{against}`, by seed: mean, 95 %", seeds_ahead)
+    head = (*head, "probability of being ahead, 95 %")
+    lines = []
+    for one in groups:
+        heights, others = (np.array(list(group.heights.values())) for group in (one, reference))
+        line = [f"`{one.label}`", _bounds(bootstrap(interquartile_mean, heights), ".0%", len(heights))]
+        found = paired(one.heights, reference.heights) if one is not reference else None
+        if found is None:
+            line += ["-", "-"]
+        else:
+            mean, half_width = found.difference
+            error = "" if half_width is None else f" +- {100 * half_width:.0f}"
+            line += [f"{100 * mean:+.0f}{error} points", f"{found.ahead:g} of {len(found.seeds)}"]
+        if one is reference:
+            line.append("-")
+        else:
+            chance = bootstrap(probability_of_improvement, heights, others)
+            line.append(_bounds(chance, ".2f", min(len(heights), len(others))))
+        lines.append(line)
+    return markdown_table(head, lines) if len(groups) > 1 else None
 
 
 def belief_table(groups: Sequence[Group]) -> str | None:
@@ -123,6 +180,12 @@ def _mean(values: Sequence[float | None], then: Callable[[float], float] = float
     """Mean of the values that there are."""
     known = [value for value in values if value is not None]
     return then(float(np.mean(known))) if known else None
+
+
+def _bounds(found: Bounds, written: str, seeds: int) -> str:
+    """A number and its interval, which one seed does not give."""
+    value, low, high = (format(number, written) for number in found)
+    return value if seeds < 2 else f"{value} ({low} to {high})"
 
 
 def _percent(one: Group) -> str:

@@ -1,4 +1,4 @@
-"""Runs as numbers that can be compared: outcomes by seed, groups by method, intervals over seeds."""
+"""Runs as numbers that can be compared: outcomes by seed, groups by method."""
 
 import statistics
 from collections.abc import Sequence
@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from experiments.analysis.load import LoadedRun, held, load, series
 from experiments.runs.errors import RunError
@@ -52,22 +51,11 @@ class Group(NamedTuple):
     variance: np.ndarray
     """Equation 1 on the transitions just met, whatever the method's own reward, `[S, T]`; NaN without a belief."""
 
-
-class Interval(NamedTuple):
-    """A mean and the 95 % confidence interval around it."""
-
-    mean: float
-    half_width: float | None
-    """Student's t with one degree of freedom less than there are seeds. None: of one seed there is none."""
-
-
-def interval(values: np.ndarray) -> Interval:
-    """Mean of `values [S]` and its 95 % interval by Student's t: wide where seeds are few, as it should be."""
-    count = len(values)
-    if count < 2:
-        return Interval(float(np.mean(values)), None)
-    error = np.std(values, ddof=1) / np.sqrt(count)
-    return Interval(float(np.mean(values)), float(stats.t.ppf(0.975, count - 1) * error))
+    @property
+    def heights(self) -> dict[int, float]:
+        """Seed -> mean height of its coverage curve, 0 to 1."""
+        means = self.coverage.mean(axis=1).tolist()
+        return {outcome.seed: mean for outcome, mean in zip(self.outcomes, means, strict=True)}
 
 
 def outcomes(run: LoadedRun) -> list[Outcome]:

@@ -5,11 +5,10 @@ import json
 import re
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from experiments import compare
-from experiments.analysis import statistics
+from experiments.analysis import intervals, statistics
 from experiments.runs import schedule
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
@@ -74,14 +73,6 @@ def test_runs_of_different_lengths_meet_at_a_step(runs: list[Path], tmp_path: Pa
         statistics.group([short], until=600)
 
 
-def test_the_interval_is_students():
-    # mean 2, standard error 1 / sqrt(3), and 4.3027 as every table of t has it for 2 degrees of freedom
-    mean, half_width = statistics.interval(np.array([1.0, 2.0, 3.0]))
-    assert mean == 2.0
-    assert half_width == pytest.approx(4.3027 / np.sqrt(3), rel=1e-4)
-    assert statistics.interval(np.array([5.0])) == (5.0, None)
-
-
 def test_names_tell_settings_of_one_method_apart(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture):
     again = write_run(tmp_path / "e", "implicit", 0, [25, 50])
     named = [f"cold={runs[0]}", f"hot={again}", str(runs[1])]
@@ -121,6 +112,18 @@ def test_refuses(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture
     assert not (tmp_path / "out").exists()
 
 
+def test_against_names_the_one_that_others_are_compared_with(
+    runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture
+):
+    assert compare.main([*map(str, runs), f"--out={tmp_path / 'out'}", "--against=random"]) == 0
+    paired = capsys.readouterr().out.split("\n\n")[1]
+    assert "seeds ahead of `random`" in paired and "1 of 1" in paired
+    assert compare.main([*map(str, runs), f"--out={tmp_path / 'two'}", "--against=randm"]) == 1
+    told = capsys.readouterr().err
+    assert "against='randm'" in told and "'random'" in told
+    assert not (tmp_path / "two").exists()
+
+
 def test_refuses_a_run_that_has_not_finished(runs: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture):
     metrics = runs[0] / "metrics.jsonl"
     metrics.write_text("".join(metrics.read_text().splitlines(keepends=True)[:10]))
@@ -146,7 +149,7 @@ def test_beliefs_are_told_of_where_there_are_any(runs: list[Path], tmp_path: Pat
     add_belief(runs[1], 1.5, 8.0, None)
     add_belief(runs[2], 1.0, 8.0, 0.5, step=500)  # asked half-way: that is not what is compared
     assert compare.main([*map(str, runs), f"--out={tmp_path / 'out'}"]) == 0
-    told, belief, calibration, total = capsys.readouterr().out.split("\n\n")
+    told, _, belief, calibration, total = capsys.readouterr().out.split("\n\n")
     assert len(told.splitlines()) == 4
     assert belief.splitlines()[2:] == ["| `implicit` | 1 | -, - | -, - | 2, 3 | -, - |"]
     # two of three were asked; a ratio of 2 and one of 8 are 4 on average
@@ -190,7 +193,7 @@ def test_committed_runs_are_there_and_are_what_the_readme_shows():
     readme = (ROOT / "experiments/results/README.md").read_text()
     for one in groups:
         assert len(one.outcomes) == 5
-        mean, half_width = statistics.interval(one.coverage.mean(axis=1))
+        mean, half_width = intervals.interval(one.coverage.mean(axis=1))
         shown = f"{mean:.0%} +- {100 * half_width:.0f}"
         assert re.search(rf"^\| `{one.label}` \| [\d, ]+ \| {re.escape(shown)} \|", readme, re.M)
 

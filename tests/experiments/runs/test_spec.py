@@ -117,6 +117,17 @@ def test_the_smoke_preset_is_smaller_in_everything_that_costs():
     assert smoke.steps > smoke.explorer.warm_up_steps + 10 * smoke.explorer.steps_per_round
 
 
+def test_what_was_chosen_for_the_generator_is_not_static_networks():
+    """One preset, two rates: each belief has the one that was tried with it; everything else they share."""
+    proposed, static = (preset_config("laptop", "ant_maze", method).explorer for method in ("implicit", "disagreement"))
+    assert (proposed.fit.lr, static.fit.lr) == (6e-3, 3e-3)
+    assert dataclasses.replace(proposed, fit=static.fit) == static
+    for method in ("implicit_reactive", "implicit_grad"):
+        assert preset_config("laptop", "ant_maze", method).explorer.fit.lr == 6e-3
+    assert preset_config("laptop", "ant_maze", "random").explorer.fit.lr == 3e-3
+    assert preset_config("paper", "ant_maze").explorer.fit == preset_config("paper", "ant_maze", "max").explorer.fit
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_json_and_back(preset: str):
     config = preset_config(preset)
