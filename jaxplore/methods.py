@@ -111,7 +111,9 @@ def as_max(config: ExplorationConfig) -> ExplorationConfig:
 
 
 def as_max_reactive(config: ExplorationConfig) -> ExplorationConfig:
-    """nnaisense/max's command JDRX: 100 updates on real data in each round."""
+    """nnaisense/max's command JDRX: 100 updates on real data in each round, of 25 steps."""
+    if config.dynamics.target == "one_hot":
+        return config
     config = as_max(config)
     return dataclasses.replace(config, reactive=dataclasses.replace(config.reactive, updates=100))
 
@@ -123,7 +125,7 @@ def as_max_trajectory(config: ExplorationConfig) -> ExplorationConfig:
 
 
 def as_max_prediction_error(config: ExplorationConfig) -> ExplorationConfig:
-    """nnaisense/max's command PERX: 100 updates on real data in each round, alpha 0.2."""
+    """nnaisense/max's command PERX: 100 updates on real data in each round, of 25 steps, alpha 0.2."""
     config = as_max_reactive(config)
     return dataclasses.replace(config, sac=dataclasses.replace(config.sac, alpha=0.2))
 
@@ -138,7 +140,6 @@ METHODS: dict[str, Method] = {
         "generator of models, variance reward, SAC on real transitions, relabelled in each round",
         read_off(generator_belief, variance_reward),
         sac_on_real_data,
-        finite=False,
     ),
     "implicit_grad": Method(
         "generator of models, variance reward, policy by the reward's own gradient through the models",
@@ -155,7 +156,6 @@ METHODS: dict[str, Method] = {
         "static networks, variance reward, SAC on real transitions, relabelled in each round",
         read_off(static_belief, variance_reward),
         sac_on_real_data,
-        finite=False,
     ),
     "max": Method(
         "static Gaussian networks, Jensen-Renyi divergence (of probabilities Jensen-Shannon), SAC in imagination or "
@@ -169,7 +169,6 @@ METHODS: dict[str, Method] = {
         read_off(gaussian_belief, divergence_reward),
         sac_on_real_data,
         settings=as_max_reactive,
-        finite=False,
     ),
     "max_trajectory": Method(
         "static Gaussian networks, spread of the imagined changes, SAC in imagination (TVAX of nnaisense/max)",
@@ -183,13 +182,11 @@ METHODS: dict[str, Method] = {
         read_off(gaussian_belief, error_reward),
         sac_on_real_data,
         settings=as_max_prediction_error,
-        finite=False,
     ),
     "icm": Method(
         "static networks, error of their mean, SAC on real transitions with as many updates as in imagination",
         read_off(static_belief, error_reward),
         sac_on_real_data,
-        finite=False,
     ),
     "icm_active": Method(
         "static networks, error of their mean, SAC in imagination, where a model stands for the truth",
@@ -213,7 +210,6 @@ METHODS: dict[str, Method] = {
         "random network distillation with SAC on real transitions, as an ablation",
         distillation,
         lasting_sac_on_real_data,
-        finite=False,
     ),
     "rnd_active": Method(
         "random network distillation with SAC in imagination, by static networks",

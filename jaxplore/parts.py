@@ -198,9 +198,10 @@ def sac_in_imagination(sizes: Sizes, config: ExplorationConfig, signal: Signal) 
 @reads("reactive", "sac", discrete=("reactive", "ddqn"))
 def sac_on_real_data(sizes: Sizes, config: ExplorationConfig, signal: Signal) -> Behaviour:
     """SAC, or double DQN where actions are discrete, on real transitions, relabelled in each round; nothing is
-    imagined.
+    imagined. One-hot observations stay as they are.
     """
-    return make_reactive(signal, make_learner(sizes, config), sizes.obs, sizes.action, config.reactive)
+    learner, seen = make_learner(sizes, config), not sizes.one_hot_obs
+    return make_reactive(signal, learner, sizes.obs, sizes.action, config.reactive, normalize_obs=seen)
 
 
 STD_DRAWS = 1024
@@ -211,7 +212,7 @@ STD_DRAWS = 1024
 def lasting_sac_on_real_data(sizes: Sizes, config: ExplorationConfig, signal: Signal) -> Behaviour:
     """The same with a policy that is never replaced, whatever `reactive.restart_every` is."""
     learner = make_learner(sizes, config)
-    options = {"lasting": True, "std_draws": STD_DRAWS}
+    options = {"lasting": True, "std_draws": STD_DRAWS, "normalize_obs": not sizes.one_hot_obs}
     return make_reactive(signal, learner, sizes.obs, sizes.action, config.reactive, **options)
 
 

@@ -74,7 +74,7 @@ class Recorder:
 
 
 CHAIN = dataclasses.replace(CONFIG, planner="mcts", dynamics=dynamics.DynamicsConfig(hidden=(4,), target="one_hot"))
-PLANNED = ("implicit", "disagreement", "max")
+FINITE = tuple(name for name, row in METHODS.items() if row.fits(Sizes(3, 2, discrete=True, one_hot_obs=True)))
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ PLANNED = ("implicit", "disagreement", "max")
     [
         *((name, CONFIG, Sizes(3, 2)) for name, row in METHODS.items() if row.actions != "discrete"),
         *((name, CONFIG, Sizes(3, 2, True)) for name, row in METHODS.items() if row.actions != "continuous"),
-        *((name, CHAIN, Sizes(3, 2, True, True)) for name in PLANNED),
+        *((name, CHAIN, Sizes(3, 2, True, True)) for name in FINITE),
     ],
 )
 def test_a_method_reads_the_settings_that_it_declares(name, config, sizes):
@@ -102,6 +102,31 @@ def test_a_method_reads_the_settings_that_it_declares(name, config, sizes):
         assert recorder.seen - set(SHARED) | {"renyi_decay"} == declared
     assert set(SHARED) <= method.reads(config, sizes)
     assert declared <= {field.name for field in dataclasses.fields(ExplorationConfig)}
+
+
+def test_the_chain_has_every_method_of_its_figure_and_those_on_real_transitions():
+    """The paper's are `implicit`, `max`, `icm` and `disagreement`, beside double DQN, which needs a task."""
+    assert {"implicit", "max", "icm", "disagreement", "random", "prediction_error", "rnd_sac"} <= set(FINITE)
+    assert not {"icm_active", "max_trajectory", "rnd_active", "ddqn", "sac", "rnd"} & set(FINITE)
+
+
+def test_a_policy_on_real_transitions_sees_one_hot_states_as_they_are():
+    """Normalised, the state that was seen least would be the largest number."""
+    sizes = Sizes(3, 2, discrete=True, one_hot_obs=True)
+    row = METHODS["icm"]
+    behaviour = row.behaviour(sizes, CHAIN, row.signal(sizes, CHAIN))
+    state = behaviour.init(jax.random.key(0))
+    actor, obs, key = behaviour.actor(state), jnp.eye(3), jax.random.key(1)
+    plain = dynamics.init_normalizers(3, 2)
+    odd = dataclasses.replace(plain, obs=dataclasses.replace(plain.obs, mean=jnp.array([5.0, -9.0, 2.0])))
+    assert behaviour.act_greedily is not None
+    acted = [behaviour.act_greedily(key, actor, normalizers, obs) for normalizers in (plain, odd)]
+    np.testing.assert_array_equal(*acted)
+    sizes = Sizes(3, 2, discrete=True)
+    behaviour = row.behaviour(sizes, CONFIG, row.signal(sizes, CONFIG))
+    assert behaviour.act_greedily is not None
+    normalized = [behaviour.act_greedily(key, actor, normalizers, obs) for normalizers in (plain, odd)]
+    assert not np.array_equal(*normalized)
 
 
 def test_planners_read_their_own_settings():
