@@ -155,10 +155,13 @@ def check_read(argv: Sequence[str], config: RunConfig, sizes: Sizes | None = Non
         ValueError: names the flag and the methods that read it.
     """
     explorer, method = config.explorer, METHODS[config.method]
+    read = method.reads(explorer, sizes)
+    if sizes is None and method.actions == "any":  # A value that is the default is read, too, where they are choices.
+        read |= method.reads(explorer, Sizes(1, 1, discrete=True))
     fields = {item.name for item in dataclasses.fields(explorer)}
     for name in flags.given(argv):
         field = name.partition(".")[0]
-        if field not in fields or field in method.reads(explorer, sizes):
+        if field not in fields or field in read:
             continue
         if sizes is not None:
             kind = "discrete" if sizes.discrete else "numbers"
