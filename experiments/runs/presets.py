@@ -78,7 +78,7 @@ NCHAIN_PAPER = ExplorationConfig(
     fit=FitConfig(lr=1e-4, weight_decay=1e-6, batch_size=32, epochs=10, restart=False),
     ensemble=EnsembleConfig(num_members=5),
     model_free=ModelFreeConfig(updates_per_round=1),
-    reactive=ReactiveConfig(updates=10, restart_every=0, normalize_reward=True, act_greedily=False),
+    reactive=ReactiveConfig(updates=50, restart_every=0, normalize_reward=True, act_greedily=False),
 )
 """The paper's agent for the chain: after every step 10 further epochs, 5 new draws, and a tree search in them. Random
 are the first 3 episodes of 49 steps; batch 32 is ours, as the paper is silent on both."""
