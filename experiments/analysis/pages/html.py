@@ -205,7 +205,7 @@ def _table(table: Table) -> str:
         for line in table.lines
         if line
     )
-    caption = f"<caption>{escape(table.caption)}</caption>" if table.caption else ""
+    caption = f"<caption><span>{escape(table.caption)}</span></caption>" if table.caption else ""
     label = escape(table.caption or "table")
     return (
         f'<div class="scroll" role="region" tabindex="0" aria-label="{label}"><table>{caption}'

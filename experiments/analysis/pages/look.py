@@ -31,7 +31,8 @@ figure{margin:0;min-width:0}.wide{grid-column:1/-1}
 .plot>svg{display:block;width:100%;height:auto;touch-action:pan-y;cursor:crosshair;border-radius:3px}
 .defs{position:absolute;width:0;height:0}
 .many{display:grid;grid-template-columns:repeat(auto-fill,minmax(150px,1fr));gap:12px;align-items:end}
-.one p{font-size:.8125rem;margin:0}
+.one p{font-size:.75rem;margin:0;display:flex;align-items:center;gap:4px}.one p svg{flex:none;margin:0}
+.many .box{top:auto;bottom:100%}
 svg text{font-size:11px;fill:var(--soft)}
 @container (min-width:410px){svg text{font-size:9.5px}}
 @container (max-width:240px) and (min-width:181px){svg text{font-size:10px}}
@@ -46,7 +47,7 @@ svg text.key{fill:var(--c);font-weight:700}
 .c0{--c:var(--c0)}.c1{--c:var(--c1)}.c2{--c:var(--c2)}.c3{--c:var(--c3)}.c4{--c:var(--c4)}.c5{--c:var(--c5)}.c6{--c:var(--c6)}
 .cursor{stroke:var(--ink);stroke-width:1;stroke-dasharray:3 2}svg .dot{fill:var(--c);stroke:var(--paper)}
 svg .wall{fill:var(--wall)}.cell{stroke:var(--soft);stroke-width:.6}svg .here{stroke:var(--no);stroke-width:2}
-svg .v1{fill:var(--v1)}svg .v2{fill:var(--v2)}svg .v3{fill:var(--v3)}
+[class^=v]{shape-rendering:crispEdges}svg .v1{fill:var(--v1)}svg .v2{fill:var(--v2)}svg .v3{fill:var(--v3)}
 svg .v4{fill:var(--v4)}svg .v5{fill:var(--v5)}svg .v6{fill:var(--v6)}
 .legend{display:flex;flex-wrap:wrap;gap:2px 16px;list-style:none;margin:.3em 0;padding:0;font-size:.875rem}
 .legend b,.one b,.box b{color:var(--c)}.sample{width:22px;height:8px;margin-right:5px}
@@ -62,6 +63,7 @@ border-radius:4px;padding:3px 10px;cursor:pointer}
 .scroll{overflow-x:auto;margin:.6em 0}
 table{border-collapse:collapse;font-size:.8125rem;font-variant-numeric:tabular-nums}
 caption{text-align:left;color:var(--soft);padding-bottom:.3em}
+caption span{display:block;position:sticky;left:0;max-width:calc(100vw - 32px)}
 th,td{padding:3px 12px 3px 0;border-bottom:1px solid var(--rim);text-align:right;font-weight:400;white-space:nowrap}
 th:first-child{text-align:left}thead th{font-weight:600;vertical-align:bottom;white-space:normal;overflow-wrap:normal}
 pre{background:color-mix(in srgb,var(--grid) 60%,transparent);padding:10px;border-radius:4px;overflow-x:auto;
