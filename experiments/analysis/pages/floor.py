@@ -74,11 +74,14 @@ def draw(panel: FloorVisits, name: str, cells: Histogram) -> str:
         y0, y1 = (float(np.clip(up(y), 6, 6 + rows * unit)) for y in (edges[1], edges[3]))
         return f"M{x0:.1f} {y0:.1f}H{x1:.1f}V{y1:.1f}H{x0:.1f}Z"
 
+    xs = [f"{32 + column * unit:.1f}" for column in range(columns + 1)]
+    ys = [f"{6 + (rows - row) * unit:.1f}" for row in range(rows + 1)]
     shades = []
     shade = np.searchsorted(levels, cells.counts, side="right")
     for level in range(1, len(levels) + 1):
         squares = "".join(
-            f"M{32 + column * unit:.1f} {6 + (rows - row) * unit:.1f}h{unit:.2f}v-{unit:.2f}h-{unit:.2f}z"
+            # Neighbours have the very same edges, so that nothing shines through between them.
+            f"M{xs[column]} {ys[row]}H{xs[column + 1]}V{ys[row + 1]}H{xs[column]}Z"
             for row, column in np.argwhere(shade == level).tolist()
         )
         shades.append(f'<path class="v{shade_of(level, len(levels))}" d="{squares}"/>')
