@@ -15,7 +15,7 @@ import pytest
 
 from envs.base import FloorPlan
 from experiments.analysis import page
-from experiments.analysis.pages import svg
+from experiments.analysis.pages import look, svg
 from experiments.runs.errors import RunError
 
 HOSTILE = "</script><script>alert('x')</script>|`*&\"x"
@@ -420,3 +420,27 @@ def test_values_can_be_read_off_in_a_browser(tmp_path: Path, width: int):
     assert (out["seeds"], out["without"]) == (6, 0)
     assert "visits" in out["floor"]
     assert (out["width"], out["wide"]) == (width, 0)
+
+
+def luminance(colour: str) -> float:
+    """WCAG's relative luminance of `#rgb` or `#rrggbb`."""
+    digits = colour.lstrip("#")
+    digits = "".join(2 * one for one in digits) if len(digits) == 3 else digits
+    parts = [int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)]
+    red, green, blue = (part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts)
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue
+
+
+@pytest.mark.parametrize("mode", ["light", "dark"])
+def test_colours_stand_out_from_their_ground(mode: str):
+    light, dark = re.findall(r":root\{(.*?)\}", look.STYLE, re.DOTALL)
+    colours = dict(re.findall(r"--(\w+):(#\w+)", light if mode == "light" else dark))
+    ground = luminance(colours["paper"])
+
+    def contrast(name: str) -> float:
+        high, low = sorted((luminance(colours[name]), ground), reverse=True)
+        return (high + 0.05) / (low + 0.05)
+
+    # WCAG: 4.5 for text, which a curve's letter is, too, but in bold and beside its line; 3 for graphics.
+    assert min(contrast(name) for name in ("ink", "soft", "link", "yes", "no", "open")) >= 4.5
+    assert min(contrast(f"c{i}") for i in range(svg.COLOURS)) >= 3.0
