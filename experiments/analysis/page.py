@@ -74,7 +74,7 @@ class Report(NamedTuple):
     title: str
     sections: list[Section]
     made: str
-    notes: list[str] = []
+    notes: list[str] = []  # noqa: RUF012  (of a named tuple, and nobody writes to it)
 
 
 def write(report: Report, out: Path, refresh: float | None = None) -> Path:

@@ -71,9 +71,7 @@ def at_least(label: str, least: float, part: int = 0) -> Condition:
     return Condition(f"{label} at {least:.0%} on every seed", part, decide, of_ends=True)
 
 
-def _beside(
-    label: str, scores: Scores, compare: Callable[[float, float], tuple[bool, bool]]
-) -> tuple[Answer, str]:
+def _beside(label: str, scores: Scores, compare: Callable[[float, float], tuple[bool, bool]]) -> tuple[Answer, str]:
     values = np.array(list(scores.get(label, {}).values()))
     if not len(values):
         return "not run", f"no runs of {label}"
@@ -83,9 +81,7 @@ def _beside(
     return "holds" if good else "does not hold" if bad else "undecided", f"{label}: {number(mean)}{width}"
 
 
-def judge(
-    conditions: Sequence[Condition], scores: Sequence[Scores], ends: Sequence[Scores]
-) -> tuple[Answer, str]:
+def judge(conditions: Sequence[Condition], scores: Sequence[Scores], ends: Sequence[Scores]) -> tuple[Answer, str]:
     """The claim's answer, and the reasons of all conditions.
 
     It holds if every condition does, and does not hold if one of them does not. Where there is nothing to ask, it was

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 from experiments.analysis.measures import CELLS, COVERAGE, RETURN, VARIANCE, VISITS, WHOLE, Measure
 from experiments.analysis.verdicts import Condition, ahead, at_least, at_most
-from experiments.runs.config import RunConfig, replace
+from experiments.runs.config import PRESETS, RunConfig, replace
 from experiments.runs.presets import preset_config
 from jaxplore import METHODS, validate
 
@@ -38,6 +38,8 @@ class Cell(NamedTuple):
     """The runs whose policies these start from, seed by seed."""
     parent_at: Mapping[str, int] = {}
     """The parent's step of each preset; without one, its end."""
+    keep_at: Mapping[str, tuple[int, ...]] = {}
+    """Of each preset, the steps whose checkpoints others start from."""
     warm_up: WarmUp | None = None
     """Who acts in the warm-up: a policy that came from a parent, nobody (there is none), or chance. None: as the
     preset has it."""
@@ -56,6 +58,8 @@ class Part(NamedTuple):
     title: str
     measure: Measure
     cells: tuple[Cell, ...]
+    presets: tuple[str, ...] = PRESETS
+    """With which it is made."""
 
 
 class Figure(NamedTuple):
@@ -85,7 +89,8 @@ TASK_STEPS = {"paper": 1_000_000, "laptop": 200_000, "smoke": 100}
 """Of a task's policy, the exploration before it included."""
 WARM_UP_STEPS = {"paper": 10_000, "laptop": 10_000, "smoke": 50}
 LENGTHS = {"2k": 2_000, "4k": 4_000, "6k": 6_000, "8k": 8_000}
-SMOKE_LENGTHS = {"2k": 75, "4k": 75, "6k": 75, "8k": 75}
+AT = {"paper": LENGTHS, "laptop": LENGTHS, "smoke": dict.fromkeys(LENGTHS, 75)}
+"""Steps of exploration, by the name that the paper gives them."""
 
 SMOKE_EXPLORER = {"warm_up_steps": 50}
 SMOKE_RUN = {"smoke": {"checkpoint_every": 50, "explorer": SMOKE_EXPLORER}}
@@ -111,9 +116,14 @@ SAC_EXPLORING = {"lr": 1e-3, "alpha": 0.02, "reward_scale": 1.0}
 PARENTS = {method: _cells(TASK, (method,), TRANSFER_SEEDS, EXPLORE_STEPS)[0] for method in (OURS, *RIVALS)}
 
 
+PARENTS[OURS] = PARENTS[OURS]._replace(
+    keep_at={preset: tuple(dict.fromkeys(AT[preset].values())) for preset in ("paper", "laptop", "smoke")}
+)
+
+
 def _task(label: str, parent: Cell | None, warm_up: WarmUp, at: str = "", *, exploring: bool = False) -> Cell:
     """SAC on the task: from a parent's policy or from nothing, with a warm-up or without."""
-    smoke_at = {"smoke": SMOKE_LENGTHS[at], "laptop": LENGTHS[at], "paper": LENGTHS[at]} if at else {}
+    parent_at = {preset: AT[preset][at] for preset in TASK_STEPS} if at else {}
     by_preset = {}
     for preset, total in TASK_STEPS.items():
         sac: dict[str, Any] = {"hidden": SAME_WIDTHS[preset]}
@@ -124,10 +134,10 @@ def _task(label: str, parent: Cell | None, warm_up: WarmUp, at: str = "", *, exp
         if preset != "smoke":
             times = {"checkpoint_every": 10_000, "eval_every": 5_000}
         by_preset[preset] = {**times, "explorer": explorer}
-    before = {preset: smoke_at.get(preset, EXPLORE_STEPS[preset]) if parent else 0 for preset in TASK_STEPS}
+    before = {preset: parent_at.get(preset, EXPLORE_STEPS[preset]) if parent else 0 for preset in TASK_STEPS}
     # Of the smoke preset nothing is left after the parent's.
     steps = {name: total - (0 if name == "smoke" else before[name]) for name, total in TASK_STEPS.items()}
-    return Cell(label, TASK, "sac", TRANSFER_SEEDS, steps, {}, by_preset, parent, smoke_at, warm_up)
+    return Cell(label, TASK, "sac", TRANSFER_SEEDS, steps, {}, by_preset, parent, parent_at, warm_up=warm_up)
 
 
 SAC_WARM, SAC_COLD = _task("sac", None, "uniform"), _task("sac", None, "none")
@@ -291,7 +301,8 @@ def figures() -> dict[str, Figure]:
             "Whatever seeks what its models do not know explores sooner than uniform actions.",
             (
                 Part("The acrobot", WHOLE, _all_methods("acrobot", ACROBOT_STEPS, has_task=True)),
-                Part(maze, COVERAGE, _all_methods("ant_maze", EXPLORE_STEPS, has_task=False)),
+                # The smoke preset has shown by then that each runs, most of them in the maze, too.
+                Part(maze, COVERAGE, _all_methods("ant_maze", EXPLORE_STEPS, has_task=False), ("paper", "laptop")),
             ),
             tuple(ahead(one, "random", part) for part in range(2) for one in (OURS, *RIVALS)),
         ),
@@ -338,16 +349,19 @@ def config_of(cell: Cell, preset: str) -> RunConfig:
     """
     known = {item.name for item in dataclasses.fields(RunConfig)}
     config = preset_config(preset, cell.env, cell.method)
-    changes: dict[str, Any] = {"steps": cell.steps[preset], "num_seeds": SMOKE_SEEDS if preset == "smoke" else cell.seeds}
+    changes: dict[str, Any] = {
+        "steps": cell.steps[preset],
+        "num_seeds": SMOKE_SEEDS if preset == "smoke" else cell.seeds,
+    }
     for more in (cell.settings, cell.by_preset.get(preset, {})):
         changes = _merge(changes, more)
     if cell.warm_up == "none":
         changes = _merge(changes, {"explorer": {"warm_up_steps": 0 if "warm_up" in known else 1}})
+    if cell.keep_at and "keep_at" in known:
+        changes["keep_at"] = cell.keep_at[preset]
     if cell.warm_up is not None and "warm_up" in known:
         changes["warm_up"] = cell.warm_up
-    explorer = {name: value for name, value in changes.pop("explorer", {}).items()}
-    # Together: what one field may be hangs on the others.
-    return replace(config, {**changes, "explorer": explorer} if explorer else changes)
+    return replace(config, changes)
 
 
 def _merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:

@@ -111,11 +111,12 @@ def make(figures: Sequence[Figure], preset: str, out: Path) -> Plan:
     Raises:
         ValueError: an environment cannot be made here, or a setting is refused.
     """
-    jobs: dict[str, Job] = {}
+    # Absolute: a worker elsewhere has another working directory.
+    out, jobs = out.absolute(), dict[str, Job]()
     cells: dict[tuple[str, int, str], tuple[str, ...]] = {}
     for figure in figures:
         for number, part in enumerate(figure.parts):
-            for cell in part.cells:
+            for cell in part.cells if preset in part.presets else ():
                 keys = _add(cell, preset, out, jobs, figure.name, needs_walk=part.measure.needs_walk)
                 cells[figure.name, number, cell.label] = keys
         for testbed in figure.testbeds:
@@ -134,7 +135,6 @@ def _add(
     *,
     needs_walk: bool = False,
     until: int | None = None,
-    keep_at: int | None = None,
 ) -> tuple[str, ...]:
     """Put the runs of a cell among the jobs, its parent's before them, and give their keys."""
     config = config_of(cell, preset)
@@ -147,8 +147,7 @@ def _add(
     if cell.parent is not None:
         # Where checkpoints can be kept for good, one run has all lengths.
         can_keep = "keep_at" in {item.name for item in dataclasses.fields(RunConfig)}
-        more = {"keep_at": at} if can_keep else {"until": at}
-        parents = _add(cell.parent, preset, out, jobs, figure, **(more if at is not None else {}))
+        parents = _add(cell.parent, preset, out, jobs, figure, until=None if can_keep else at)
     together = env.compiled or preset == "smoke"
     first = dataclasses.replace(config, num_seeds=1)
     seeds = range(config.seed, _end(config))
@@ -162,19 +161,13 @@ def _add(
             jobs[parent.key] = parent._replace(is_parent=True)
         job = _job(RunSpec(one, ref), out, parent)
         known = jobs.get(job.key, job)
-        assert known.spec is not None
-        if keep_at is not None:
-            kept = tuple(sorted({*getattr(known.spec.config, "keep_at", ()), keep_at} - {one.steps}))
-            changed: Any = {"keep_at": kept}
-            spec = dataclasses.replace(known.spec, config=dataclasses.replace(known.spec.config, **changed))
-            known = known._replace(spec=spec)
         names = tuple(dict.fromkeys([*known.figures, figure]))
         jobs[job.key] = known._replace(figures=names, needs_walk=known.needs_walk or needs_walk)
         keys.append(job.key)
     return tuple(keys)
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def _made(name: str, obs_noise: float) -> envs.Environment:
     return envs.make(name, obs_noise=obs_noise)
 
@@ -258,6 +251,12 @@ def look(job: Job, finished: Mapping[str, Path] | None = None) -> Standing:
     return Standing(State.PARTIAL if status is Status.PARTIAL else State.TO_DO, step, job.path)
 
 
+def step_of(job: Job) -> int:
+    """How far a run has come, by its rows."""
+    row = last_row(RunDirectory(job.path).metrics_path) if job.spec is not None else None
+    return row["step"] if row else 0
+
+
 def look_all(plan: Plan, places: Iterable[Path] = ()) -> dict[str, Standing]:
     """Where all jobs of a plan stand; `places` are directories of other runs. Raises as `look`."""
     finished = find(places)
@@ -328,8 +327,8 @@ def check_out(out: Path, preset: str) -> None:
         raise RunError(f"--out={out} holds other files ({', '.join(sorted(there)[:3])}). Give another directory.")
 
 
-def write_settings(plan: Plan) -> None:
-    """Make the plan's directory, with the settings of every run.
+def write_settings(plan: Plan, standings: Mapping[str, Standing]) -> None:
+    """Make the plan's directory, with the settings of every run; parents are where they were found.
 
     Raises:
         RunError: it cannot be written.
@@ -340,7 +339,11 @@ def write_settings(plan: Plan) -> None:
         write_text(plan.out / RECORD, json.dumps({"format": 1, "preset": plan.preset}) + "\n")
         for job in plan.jobs.values():
             if job.spec is not None:
-                write_text(settings_of(job), to_json(job.spec))
+                spec = job.spec
+                if spec.parent is not None and job.parent is not None:
+                    ref = dataclasses.replace(spec.parent, directory=str(standings[job.parent].path.absolute()))
+                    spec = dataclasses.replace(spec, parent=ref)
+                write_text(settings_of(job), to_json(spec))
     except OSError as error:
         raise disk_error("start the paper", plan.out, error, "start it again") from error
 
@@ -378,7 +381,7 @@ def _unseeded(config: RunConfig) -> RunConfig:
     return dataclasses.replace(config, seed=0, num_seeds=1, eval_every=0)
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def _traced(config: RunConfig) -> int:
     env = build.make_env(config)
     leaves = jax.tree.leaves(make_programs(config, env, build.make_agent(config, env)).trace_init())
@@ -454,7 +457,8 @@ def describe(plan: Plan, standings: Mapping[str, Standing], known: Rates, at_a_t
         counts = {state: sum(standings[job.key].state is state for job in jobs) for state in State}
         seeds = [seed for job in jobs for seed in job.seeds]
         steps = "-" if jobs[0].spec is None else f"{jobs[0].spec.config.steps:,}"
-        state = ", ".join(f"{count} {one.value}" if len(jobs) > 1 else one.value for one, count in counts.items() if count)
+        there = {one.value: count for one, count in counts.items() if count}
+        state = ", ".join(f"{count} {name}" if len(jobs) > 1 else name for name, count in there.items())
         time = "no run to tell from" if any(one is None for one in left) else duration(sum(one or 0.0 for one in left))
         seen = f"{min(seeds)} to {max(seeds)}" if seeds else "-"
         lines.append((what, seen, steps, state, time, f"{need / 2**30:.1f} GiB", ", ".join(figures)))
@@ -476,5 +480,6 @@ def describe(plan: Plan, standings: Mapping[str, Standing], known: Rates, at_a_t
 
 
 def _settings_key(spec: RunSpec) -> str:
-    config = dataclasses.replace(spec.config, seed=0)
-    return RunSpec(config, dataclasses.replace(spec.parent, directory="", identity="") if spec.parent else None).identity
+    """The identity that all seeds of a setting would share."""
+    parent = dataclasses.replace(spec.parent, directory="", identity="") if spec.parent is not None else None
+    return RunSpec(dataclasses.replace(spec.config, seed=0), parent).identity
