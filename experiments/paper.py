@@ -68,13 +68,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             if parsed.report:
                 return _only_report(made, standings, rates)
             plan.check_disk(made, standings)
-            # Ours would be the same directory's for all seeds; other executors have their own folders.
             executor = _executor(asked, made, standings)
         except (ValueError, RunError) as error:
             print(f"error: {error}", file=sys.stderr)
             process.show_cause(error, debug=parsed.debug)
             return 2
         with lock.claimed(asked.out):
+            standings = plan.look_all(made, asked.places)  # Whoever had the directory until now has gone on.
             return _carry_out(asked, made, standings, rates, executor, parsed.watch, parsed.port)
     except RunError as error:
         print(f"\nerror: {error}", file=sys.stderr)
@@ -130,7 +130,7 @@ def _check(parsed: argparse.Namespace) -> _Arguments:
 
 def _rates(asked: _Arguments, made: Plan) -> Rates:
     own = made.out / plan.RUNS
-    return plan.rates(run for place in (*asked.places, own) if place.is_dir() for run in sorted(place.iterdir()))
+    return plan.rates(plan.runs_in([*asked.places, own]))
 
 
 def _executor(asked: _Arguments, made: Plan, standings: Mapping[str, Standing]) -> conduct.Executor:
@@ -209,9 +209,8 @@ def _carry_out(
     written = _write(made, found.standings, found.failed, rates)
     print(f"\n{_summary(written, made)}", flush=True)
     for key, why in found.failed.items():
-        print(
-            f"error: {made.jobs[key].name} is not finished: {why} (see {plan.log_of(made.jobs[key])})", file=sys.stderr
-        )
+        job = made.jobs[key]
+        print(f"error: {job.name} is not finished: {why} (see {plan.log_of(job)})", file=sys.stderr)
     return 1 if found.failed else 0
 
 

@@ -1,4 +1,4 @@
-"""The jobs of a plan, carried out by whatever there is to carry them out, each once and parents before their children."""
+"""The jobs of a plan, carried out by whatever executor there is: each once, and parents before their children."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""What the paper shows: its figures and its table, each with the claim, the runs that it needs, and what would decide it.
+"""What the paper shows: its figures and its table, each with its claim, the runs it needs, and what would decide it.
 
 Ratzlaff, Bai, Li, Xu, "Implicit Generative Modeling for Efficient Exploration", ICML 2020. `methods` and `beliefs` go
 beyond it.
@@ -202,8 +202,8 @@ def figures() -> dict[str, Figure]:
             "ant_reward",
             "Equation 1 in the Ant maze",
             "Figure 4b",
-            "The variance of ours rises while there is something to find and stays high until the maze is seen; that of "
-            "MAX's ensemble falls from step 2,000 on.",
+            "The variance of ours rises while there is something to find and stays high until the maze is seen; that "
+            "of MAX's ensemble falls from step 2,000 on.",
             (Part("Equation 1 on the transitions just met, mean of each round", VARIANCE, (ANT[0], ANT[4])),),
             (ahead(OURS, "max"),),
         ),
@@ -287,7 +287,7 @@ def figures() -> dict[str, Figure]:
             "rnd_psne",
             "RND and PSNE",
             "Appendix, figure on other exploration methods",
-            "Ours makes a better task's policy than RND and PSNE on HalfCheetah, and explores the maze sooner than RND.",
+            "Ours makes a better task's policy than RND and PSNE on HalfCheetah, and is quicker in the maze than RND.",
             (
                 Part("HalfCheetah, return", RETURN, (WARM[0], *_baselines())),
                 Part(maze, COVERAGE, (ANT[0], *_cells("ant_maze", ("rnd",), CONTROL_SEEDS, EXPLORE_STEPS))),

@@ -1,12 +1,13 @@
 """Figures as jobs: each run once, however many figures need it, parents before their children."""
 
+import contextlib
 import dataclasses
 import enum
 import functools
 import json
 import math
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,8 +19,9 @@ from experiments.runs import lock
 from experiments.runs.config import RunConfig
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError, disk_error
-from experiments.runs.files import write_text
+from experiments.runs.files import read_json, write_text
 from experiments.runs.metrics import last_row
+from experiments.runs.seeds import expand
 from experiments.runs.spec import RunRef, RunSpec, to_json
 from experiments.runs.status import Status
 from experiments.studies.figures_of_paper import Cell, Figure, Testbed, config_of
@@ -201,15 +203,20 @@ def _testbed(testbed: Testbed, preset: str, out: Path, figure: str) -> Job:
 def find(places: Iterable[Path]) -> dict[str, Path]:
     """Finished runs in directories of runs: identity -> where. What is damaged there is passed over."""
     found = {}
+    for path in runs_in(places):
+        directory = RunDirectory(path)
+        with contextlib.suppress(RunError, ValueError):
+            if directory.status() is Status.FINISHED:
+                found.setdefault(directory.spec().identity, path)
+    return found
+
+
+def runs_in(places: Iterable[Path]) -> Iterator[Path]:
+    """What lies in directories of runs; of several seeds' runs each."""
     for place in places:
         for path in sorted(place.iterdir()) if place.is_dir() else []:
-            directory = RunDirectory(path)
-            try:
-                if directory.status() is Status.FINISHED:
-                    found.setdefault(directory.spec().identity, path)
-            except (RunError, ValueError):
-                continue
-    return found
+            with contextlib.suppress(RunError, ValueError):
+                yield from expand(path)
 
 
 def look(job: Job, finished: Mapping[str, Path] | None = None) -> Standing:
@@ -226,7 +233,7 @@ def look(job: Job, finished: Mapping[str, Path] | None = None) -> Standing:
         ValueError: its configuration is damaged.
     """
     if job.spec is None:
-        return Standing(State.FINISHED if job.path.is_file() else State.TO_DO, 0, job.path)
+        return Standing(State.FINISHED if _is_whole(job.path) else State.TO_DO, 0, job.path)
     config, directory = job.spec.config, RunDirectory(job.path)
     status = directory.status()
     if status is not Status.ABSENT:
@@ -249,6 +256,13 @@ def look(job: Job, finished: Mapping[str, Path] | None = None) -> Standing:
         what = (row or {}).get("diverged")
         return Standing(State.DIVERGED, step, job.path, f"not finite was {what}")
     return Standing(State.PARTIAL if status is Status.PARTIAL else State.TO_DO, step, job.path)
+
+
+def _is_whole(path: Path) -> bool:
+    """Whether a testbed's file is there, and not half written."""
+    with contextlib.suppress(OSError, ValueError):
+        return bool(read_json(path))
+    return False
 
 
 def step_of(job: Job) -> int:
@@ -322,7 +336,7 @@ def check_out(out: Path, preset: str) -> None:
         if was != preset:
             raise RunError(f"--out={out} holds the paper with preset={was}. Allowed: --preset={was}, or another --out.")
         return
-    there = RunDirectory(out).entries()
+    there = {name for name in RunDirectory(out).entries() or () if ".tmp" not in name}
     if there:
         raise RunError(f"--out={out} holds other files ({', '.join(sorted(there)[:3])}). Give another directory.")
 
@@ -334,9 +348,11 @@ def write_settings(plan: Plan, standings: Mapping[str, Standing]) -> None:
         RunError: it cannot be written.
     """
     try:
-        for name in (RUNS, SETTINGS, LOGS, TESTBEDS):
-            (plan.out / name).mkdir(parents=True, exist_ok=True)
+        plan.out.mkdir(parents=True, exist_ok=True)
+        # First: with it, the directory is a paper's.
         write_text(plan.out / RECORD, json.dumps({"format": 1, "preset": plan.preset}) + "\n")
+        for name in (RUNS, SETTINGS, LOGS, TESTBEDS):
+            (plan.out / name).mkdir(exist_ok=True)
         for job in plan.jobs.values():
             if job.spec is not None:
                 spec = job.spec
