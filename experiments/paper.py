@@ -130,7 +130,7 @@ def _check(parsed: argparse.Namespace) -> _Arguments:
 
 def _rates(asked: _Arguments, made: Plan) -> Rates:
     own = made.out / plan.RUNS
-    return plan.rates(plan.runs_in([*asked.places, own]))
+    return plan.rates(plan.runs_in([*asked.places, own]), made)
 
 
 def _executor(asked: _Arguments, made: Plan, standings: Mapping[str, Standing]) -> conduct.Executor:

@@ -7,7 +7,7 @@ import functools
 import json
 import math
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -118,7 +118,7 @@ def make(figures: Sequence[Figure], preset: str, out: Path) -> Plan:
     cells: dict[tuple[str, int, str], tuple[str, ...]] = {}
     for figure in figures:
         for number, part in enumerate(figure.parts):
-            for cell in part.cells if preset in part.presets else ():
+            for cell in part.of(preset):
                 keys = _add(cell, preset, out, jobs, figure.name, needs_walk=part.measure.needs_walk)
                 cells[figure.name, number, cell.label] = keys
         for testbed in figure.testbeds:
@@ -200,14 +200,17 @@ def _testbed(testbed: Testbed, preset: str, out: Path, figure: str) -> Job:
 # Where jobs stand.
 
 
-def find(places: Iterable[Path]) -> dict[str, Path]:
-    """Finished runs in directories of runs: identity -> where. What is damaged there is passed over."""
+def find(places: Iterable[Path], wanted: Collection[str]) -> dict[str, Path]:
+    """Finished runs in directories of runs, of these identities: identity -> where. What is damaged there is passed
+    over.
+    """
     found = {}
     for path in runs_in(places):
         directory = RunDirectory(path)
         with contextlib.suppress(RunError, ValueError):
-            if directory.status() is Status.FINISHED:
-                found.setdefault(directory.spec().identity, path)
+            identity = directory.spec().identity
+            if identity in wanted and directory.status() is Status.FINISHED:
+                found.setdefault(identity, path)
     return found
 
 
@@ -273,7 +276,7 @@ def step_of(job: Job) -> int:
 
 def look_all(plan: Plan, places: Iterable[Path] = ()) -> dict[str, Standing]:
     """Where all jobs of a plan stand; `places` are directories of other runs. Raises as `look`."""
-    finished = find(places)
+    finished = find(places, plan.jobs)
     return {key: look(job, finished) for key, job in plan.jobs.items()}
 
 
@@ -425,17 +428,26 @@ Rates = Mapping[tuple[str, str, str], float]
 """Environment, method and preset -> seconds for a step of a seed."""
 
 
-def rates(runs: Iterable[Path]) -> dict[tuple[str, str, str], float]:
+def rates(runs: Iterable[Path], plan: Plan | None = None) -> dict[tuple[str, str, str], float]:
     """What a step has taken in runs of before, by environment, method and preset: medians. What is damaged is passed
     over.
+
+    Args:
+        runs: directories.
+        plan: whose methods are asked for; None: all.
     """
+    specs = [job.spec for job in plan.jobs.values()] if plan is not None else []
+    wanted = {(spec.config.env, spec.config.method) for spec in specs if spec is not None}
     found: dict[tuple[str, str, str], list[float]] = {}
     for path in runs:
         directory = RunDirectory(path)
         try:
+            raw = read_json(path / "config.json")
+            if plan is not None and (raw.get("env"), raw.get("method")) not in wanted:
+                continue
             rows = directory.rows() if directory.is_kept() else [last_row(directory.metrics_path)]
             config, row = directory.config(), rows[-1] if rows else None
-        except (RunError, ValueError):
+        except (RunError, ValueError, OSError):
             continue
         if row and row.get("wall_time") and row["step"] > config.explorer.warm_up_steps:
             seconds = row["wall_time"] / row["step"] / config.num_seeds

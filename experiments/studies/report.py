@@ -94,7 +94,7 @@ def _section(
     tables, scores, ends, everything = list[Table](), list[Any](), list[Any](), list[LoadedRun]()
     for i, part in enumerate(figure.parts):
         lines: dict[str, Line] = {}
-        for cell in part.cells:
+        for cell in part.of(plan.preset):
             keys = plan.cells.get((figure.name, i, cell.label), ())
             paths = [standings[key].path for key in keys if standings[key].state is State.FINISHED]
             line = measured(cell, part.measure, [load(path) for path in paths])
