@@ -54,4 +54,20 @@ def write(spec: RunSpec, path: Path, cells: Mapping[int, int] | None = None, val
     return path
 
 
-__all__ = ["COVERAGE", "RETURN", "VISITS", "WHOLE", "cell", "figure", "finish", "write"]
+LONG = dict.fromkeys(("smoke", "laptop", "paper"), 2_000)
+SMALL_CELLS = tuple(
+    Cell(
+        f"noise {noise}",
+        "acrobot",
+        "random",
+        2,
+        LONG,
+        {"checkpoint_every": 100, "obs_noise": noise, "explorer": {"warm_up_steps": 50}},
+    )
+    for noise in (0.0, 0.1, 0.2)
+)
+SMALL = figure("small", SMALL_CELLS)
+"""Of random actions, which compile in no time."""
+
+
+__all__ = ["COVERAGE", "RETURN", "SMALL", "VISITS", "WHOLE", "cell", "figure", "finish", "write"]
