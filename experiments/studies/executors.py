@@ -7,6 +7,7 @@ its run with it, and the run resumes from its latest checkpoint wherever it is s
 import contextlib
 import importlib
 import os
+import socket
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,6 +26,8 @@ PATIENCE = 90.0
 """Seconds that a worker waits for a run that another one still owns."""
 MINUTES = 24 * 60
 """Of a Slurm job; a run that does not get through in that time resumes in the next one."""
+REACH = 10.0
+"""Seconds in which a Ray cluster must answer."""
 ON_MACHINES = 1_000
 """Jobs at a time where a scheduler decides."""
 
@@ -145,6 +148,7 @@ def ray(memory: int, variables: Mapping[str, str], address: str | None = None) -
     package = _package("ray", "ray")
     address = address or os.environ.get("RAY_ADDRESS")
     try:
+        _knock(address)
         if not package.is_initialized():
             # A job waits in a process of its own; what computes is the process that it starts.
             more = {} if address else {"num_cpus": machine.cores(), "include_dashboard": False}
@@ -175,6 +179,13 @@ def ray(memory: int, variables: Mapping[str, str], address: str | None = None) -
         package.wait(list(refs), num_returns=len(refs), timeout=execute.GRACE)
 
     return Executor("ray", ON_MACHINES, start, poll, stop)
+
+
+def _knock(address: str | None) -> None:
+    """Raise `OSError` where nobody answers at an address; Ray itself asks for minutes."""
+    host, _, port = (address or "").rpartition("://")[2].rpartition(":")
+    if host and port.isdecimal():
+        socket.create_connection((host, int(port)), timeout=REACH).close()
 
 
 def _package(name: str, extra: str) -> Any:

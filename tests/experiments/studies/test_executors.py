@@ -134,7 +134,6 @@ def test_a_cluster_out_of_reach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         executors.slurm(tmp_path / "workers", MEMORY, {})
 
 
-@pytest.mark.slow
 def test_a_ray_cluster_out_of_reach(monkeypatch: pytest.MonkeyPatch):
     pytest.importorskip("ray")
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
