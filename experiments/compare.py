@@ -4,15 +4,20 @@ Runs of one method with different settings are kept apart by a name of your own 
 """
 
 import argparse
+import csv
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from experiments import process
 from experiments.analysis import comparison
+from experiments.analysis.load import columns
 from experiments.runs import modules
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError, disk_error
+from experiments.runs.files import replacing
 from experiments.runs.seeds import expand
 
 
@@ -22,6 +27,22 @@ def split_name(argument: str) -> tuple[str | None, Path]:
     if not equals or not name or Path(argument).exists():
         return None, Path(argument)
     return name, Path(path)
+
+
+def write_csv(path: Path, table: Mapping[str, np.ndarray]) -> None:
+    """Write columns as CSV; what is not there is empty.
+
+    Raises:
+        RunError: the file cannot be written.
+    """
+    try:
+        with replacing(path) as draft, draft.open("w", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(table)
+            for line in zip(*(column.tolist() for column in table.values()), strict=True):
+                writer.writerow(["" if value != value else value for value in line])
+    except OSError as error:
+        raise disk_error("write the rows", path, error) from error
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -38,6 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--keep", type=Path, help="also copy what a comparison needs of each run to this directory; they are runs, too"
     )
+    parser.add_argument("--csv", type=Path, help="also write the rows of all runs to this file, with their names")
     modules.add_flag(parser)
     process.add_flag(parser)
     arguments = parser.parse_args(argv)
@@ -48,6 +70,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         pairs = map(split_name, arguments.runs)
         names, runs = zip(*((name, run) for name, path in pairs for run in expand(path)), strict=True)
         text = comparison.write(runs, names, arguments.out, arguments.until, arguments.against)
+        if arguments.csv:
+            write_csv(arguments.csv, columns(runs, names, arguments.until))
         if arguments.keep:
             try:
                 for run in runs:

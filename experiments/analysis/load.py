@@ -10,7 +10,7 @@ import numpy as np
 from experiments.runs.config import RunConfig
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
-from experiments.runs.rows import check
+from experiments.runs.rows import FIELDS, check
 from experiments.runs.scene import Scene
 from experiments.runs.schedule import gap
 from experiments.runs.status import Status
@@ -100,3 +100,39 @@ def held(values: np.ndarray) -> np.ndarray:
     """
     at = np.where(np.isfinite(values), np.arange(values.shape[1]), 0)
     return np.take_along_axis(values, np.maximum.accumulate(at, axis=1), axis=1)
+
+
+def columns(
+    runs: Sequence[Path], names: Sequence[str | None] | None = None, until: int | None = None
+) -> dict[str, np.ndarray]:
+    """The rows of finished runs as columns: `pandas.DataFrame(columns(runs))`, `polars.DataFrame(columns(runs))`.
+
+    Args:
+        runs: directories.
+        names: of each run, what it counts under; None: its method.
+        until: steps of each run; None: all.
+
+    Returns:
+        `name`, `run`, `env`, `method`, `preset` as text, then every field of the rows, in the order of
+        `experiments.runs.rows`, `[rows]` each; numbers, NaN where a row has none, and text where a field is.
+
+    Raises:
+        RunError, ValueError: as `load`.
+    """
+    table: list[dict[str, Any]] = []
+    for path, name in zip(runs, names or [None] * len(runs), strict=True):
+        run = load(path, until)
+        config = run.config
+        own = {"name": name or config.method, "run": str(path), "env": config.env, "method": config.method}
+        table += [{**own, "preset": config.preset, **row} for row in run.rows]
+    found = dict.fromkeys(field for row in table for field in row)
+    order = [field for field in ("name", "run", "env", "method", "preset", *FIELDS) if field in found]
+    return {field: _column([row.get(field) for row in table]) for field in dict.fromkeys([*order, *found])}
+
+
+def _column(values: Sequence[Any]) -> np.ndarray:
+    if any(isinstance(value, str) for value in values):
+        return np.array(["" if value is None else value for value in values])
+    if all(type(value) is int for value in values):
+        return np.array(values)
+    return np.array([np.nan if value is None else value for value in values], dtype=float)

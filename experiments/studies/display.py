@@ -21,7 +21,46 @@ RECENT = 20
 """Rounds that the pace of a seed is taken from."""
 
 
-class Display:
+class Screen:
+    """Lines on a terminal that are drawn over; elsewhere only what is said.
+
+    Args:
+        stream: where to write, stderr by default.
+        live: whether lines are drawn over; by default, whether `stream` is a terminal that can do that.
+    """
+
+    def __init__(self, stream: TextIO | None = None, live: bool | None = None) -> None:
+        self._stream = stream or sys.stderr
+        able = self._stream.isatty() and os.name != "nt" and os.environ.get("TERM", "dumb") != "dumb"
+        self.live = able if live is None else live
+        self._drawn = 0
+
+    def say(self, text: str) -> None:
+        """Prints a line; where lines are drawn over, above them."""
+        self.clear()
+        print(text, file=self._stream, flush=True)
+
+    def clear(self) -> None:
+        """Takes away what is drawn."""
+        if self._drawn:
+            self._write(f"\x1b[{self._drawn}F\x1b[J")
+            self._drawn = 0
+
+    def draw(self, lines: Sequence[str]) -> None:
+        """Draws lines over those drawn before; where they do not fit, the last one."""
+        columns, height = shutil.get_terminal_size()
+        if len(lines) > height - 1:  # The cursor cannot go back to what has scrolled away.
+            lines = lines[-1:]
+        back = f"\x1b[{self._drawn}F" if self._drawn else ""
+        self._write(back + "".join(f"{line[: columns - 1]}\x1b[K\n" for line in lines) + "\x1b[J")
+        self._drawn = len(lines)
+
+    def _write(self, text: str) -> None:
+        self._stream.write(text)
+        self._stream.flush()
+
+
+class Display(Screen):
     """How far all seeds are, on stderr: on a terminal lines that are drawn over, elsewhere one for each tenth of all.
 
     Args:
@@ -41,14 +80,12 @@ class Display:
         stream: TextIO | None = None,
         live: bool | None = None,
     ) -> None:
-        self._stream = stream or sys.stderr
-        able = self._stream.isatty() and os.name != "nt" and os.environ.get("TERM", "dumb") != "dumb"
-        self._live = able if live is None else live
+        super().__init__(stream, live)
         self._config, self._at_a_time, self._num_cells = config, at_a_time, num_cells
         self._steps = {config.seed + i: 0 for i in range(config.num_seeds)}
         self._ended: set[int] = set()
         self._recent = {seed: deque[tuple[float, int]](maxlen=RECENT) for seed in self._steps}
-        self._drawn = self._tenths = 0
+        self._tenths = 0
 
     def begin(self, steps: Mapping[int, int], ended: Sequence[int]) -> None:
         """Where seeds are that have taken steps before, and which of them will take no more."""
@@ -61,8 +98,8 @@ class Display:
         for seed, row in rows.items():
             if row is not None:
                 self._note(seed, row["step"])
-        if self._live:
-            self._draw([*(self._line(seed, row) for seed, row in rows.items()), f"{'all':<9}{self._all(rows)}"])
+        if self.live:
+            self.draw([*(self._line(seed, row) for seed, row in rows.items()), f"{'all':<9}{self._all(rows)}"])
         elif self._tenth() > self._tenths:
             self._tenths = self._tenth()
             at = (f"seed {seed} at {row['step']:,}, {self._seen(row, 1)}" for seed, row in rows.items() if row)
@@ -77,29 +114,6 @@ class Display:
             self.say(f"Seed {seed} failed after step {self._steps[seed]:,}: {error}")
         else:
             self.say(f"Seed {seed} is done: {self._seen(row, 1)} in {duration(row['wall_time'])}")
-
-    def say(self, text: str) -> None:
-        """Prints a line; where lines are drawn over, above them."""
-        self.clear()
-        print(text, file=self._stream, flush=True)
-
-    def clear(self) -> None:
-        """Takes away what is drawn."""
-        if self._drawn:
-            self._write(f"\x1b[{self._drawn}F\x1b[J")
-            self._drawn = 0
-
-    def _draw(self, lines: Sequence[str]) -> None:
-        columns, height = shutil.get_terminal_size()
-        if len(lines) > height - 1:  # The cursor cannot go back to what has scrolled away.
-            lines = lines[-1:]
-        back = f"\x1b[{self._drawn}F" if self._drawn else ""
-        self._write(back + "".join(f"{line[: columns - 1]}\x1b[K\n" for line in lines) + "\x1b[J")
-        self._drawn = len(lines)
-
-    def _write(self, text: str) -> None:
-        self._stream.write(text)
-        self._stream.flush()
 
     def _note(self, seed: int, step: int) -> None:
         """A seed is at a step. Its pace is that of rounds that learn, from the end of the first one in this process on:

@@ -41,7 +41,9 @@ class End(NamedTuple):
     """What it said was wrong, in a line; None: nothing was."""
 
 
-class _Process(NamedTuple):
+class Process(NamedTuple):
+    """A command that is being carried out."""
+
     job: Job
     popen: subprocess.Popen[bytes]
     before: int
@@ -67,27 +69,36 @@ def run_all(
     Returns:
         How each has ended.
     """
-    waiting, running, ended = deque(jobs), list[_Process](), dict[int, End]()
+    waiting, running, ended = deque(jobs), list[Process](), dict[int, End]()
     try:
         while waiting or running:
             while waiting and len(running) < at_a_time:
                 job = waiting.popleft()
                 try:
-                    running.append(_start(job, variables or {}))
+                    running.append(start(job, variables or {}))
                 except OSError as error:
                     ended[job.key] = End(-1, f"cannot be started ({error})")
             tell([one.job.key for one in running], ended)
             time.sleep(POLL)
             for one in [one for one in running if one.popen.poll() is not None]:
                 running.remove(one)
-                ended[one.job.key] = _end(one)
+                ended[one.job.key] = end(one)
         tell([], ended)
     finally:
-        _stop(running)
+        stop(running)
     return ended
 
 
-def _start(job: Job, variables: Mapping[str, str]) -> _Process:
+def start(job: Job, variables: Mapping[str, str]) -> Process:
+    """Start a command in a process that this one holds: it stops when this one ends.
+
+    Args:
+        job: the command.
+        variables: of the environment, in addition to this process's.
+
+    Raises:
+        OSError: it cannot be started.
+    """
     # What this process can import it can, too: beside Python's own folders, which it finds by itself.
     own = tuple(sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib", "purelib", "platlib"))
     path = os.pathsep.join(entry for entry in sys.path if entry and not entry.startswith(own))
@@ -96,10 +107,10 @@ def _start(job: Job, variables: Mapping[str, str]) -> _Process:
         before = log.tell()
         command = [sys.executable, *job.words]
         popen = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=log, stderr=log, env=environment)
-    return _Process(job, popen, before)
+    return Process(job, popen, before)
 
 
-def _stop(running: Sequence[_Process]) -> None:
+def stop(running: Sequence[Process]) -> None:
     """End processes: by asking, then by force."""
     if not running:
         return
@@ -118,13 +129,14 @@ def _stop(running: Sequence[_Process]) -> None:
             one.popen.wait()
 
 
-def _let_go(one: _Process) -> None:
+def _let_go(one: Process) -> None:
     if one.popen.stdin is not None:
         with contextlib.suppress(OSError):
             one.popen.stdin.close()
 
 
-def _end(one: _Process) -> End:
+def end(one: Process) -> End:
+    """How a process that has ended did."""
     status = one.popen.returncode
     _let_go(one)
     return End(status, None if status == 0 else _reason(status, one.job.log, one.before))

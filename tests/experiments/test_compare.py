@@ -5,10 +5,12 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from experiments import compare
 from experiments.analysis import intervals, statistics
+from experiments.analysis.load import columns
 from experiments.runs import schedule
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
@@ -204,3 +206,30 @@ def test_damaged_metrics_are_told(runs: list[Path], tmp_path: Path, capsys: pyte
     packed.write_bytes(packed.read_bytes()[:-20])
     assert compare.main([str(packed.parent), f"--out={tmp_path / 'out'}"]) == 1
     assert "read the metrics" in capsys.readouterr().err
+
+
+def test_rows_as_columns_and_as_csv(runs: list[Path], tmp_path: Path):
+    table = columns(runs, [None, "mine", None, None], until=300)
+    assert list(table)[:6] == ["name", "run", "env", "method", "preset", "step"]
+    assert len({len(column) for column in table.values()}) == 1
+    assert sorted(set(table["name"].tolist())) == ["implicit", "mine", "random"]
+    of_b = table["name"] == "mine"
+    assert table["seed"][of_b].tolist() == [1] * 13
+    assert table["step"][of_b].tolist() == [*range(25, 256, 25), 256, 275, 300]
+    assert table["cells"][of_b][:5].tolist() == [1, 2, 3, 4, 5]
+    path = tmp_path / "rows.csv"
+    words = [*map(str, runs), f"--out={tmp_path / 'out'}", "--until=300", f"--csv={path}"]
+    assert compare.main(words) == 0
+    lines = path.read_text().splitlines()
+    assert lines[0].startswith("name,run,env,method,preset,step,seed,coverage,cells")
+    assert len(lines) == 1 + 13 * len(runs)
+    assert lines[1].startswith(f"implicit,{runs[0]},ant_maze,implicit,laptop,25,0,")
+
+
+def test_columns_have_nothing_where_a_row_has_none(runs: list[Path]):
+    path = RunDirectory(runs[0]).metrics_path
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    lines[0]["variance"] = 0.5
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    variance = columns(runs[:1])["variance"]
+    assert variance[0] == 0.5 and np.isnan(variance[1:]).all()

@@ -1,0 +1,69 @@
+import dataclasses
+
+import pytest
+
+from experiments.runs.config import PRESETS, RunConfig
+from experiments.studies import figures_of_paper
+from experiments.studies.figures_of_paper import config_of, figures
+from jaxplore.validate import FieldError
+
+NAMES = ("chain", "acrobot", "ant_coverage", "ant_reward", "ant_visits", "hand", "transfer", "transfer_length")
+NAMES = (*NAMES, "transfer_cold", "table_sac", "disagreement_full", "rnd_psne", "methods", "beliefs")
+
+
+def test_every_figure_is_there_in_the_papers_order():
+    assert tuple(figures()) == NAMES
+    assert [figure.name for figure in figures_of_paper.choose(("hand", "chain"))] == ["chain", "hand"]
+
+
+def test_an_unknown_one_has_its_nearest():
+    with pytest.raises(FieldError, match="Did you mean 'ant_reward'"):
+        figures_of_paper.choose(("ant_rewards",))
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_cell_makes_a_configuration(preset: str):
+    cells = [cell for figure in figures().values() for part in figure.parts for cell in part.cells]
+    assert len(cells) > 80
+    for cell in cells:
+        config = config_of(cell, preset)
+        assert (config.env, config.method, config.preset) == (cell.env, cell.method, preset)
+        assert config.num_seeds == (2 if preset == "smoke" else cell.seeds)
+
+
+def test_the_papers_seeds_and_steps():
+    chain, ant = figures()["chain"].parts[0].cells, figures()["ant_coverage"].parts[0].cells
+    assert {(cell.seeds, cell.steps["paper"]) for cell in chain} == {(3, 15 * 49)}
+    assert {(cell.seeds, cell.steps["paper"]) for cell in ant} == {(5, 10_000)}
+    # A million in all, those of the exploration included.
+    task = {cell.label: config_of(cell, "paper").steps for cell in figures()["transfer"].parts[0].cells}
+    assert task == {"implicit": 990_000, "max": 990_000, "icm": 990_000, "disagreement": 990_000, "sac": 1_000_000}
+    lengths = {cell.label: config_of(cell, "paper").steps for cell in figures()["transfer_length"].parts[0].cells}
+    assert lengths["init-2k"] == 998_000 and lengths["init-10k"] == 990_000
+
+
+def test_conditions_ask_for_labels_that_there_are():
+    for figure in figures().values():
+        for condition in figure.conditions:
+            labels = {cell.label for cell in figure.parts[condition.part].cells}
+            scores = {label: {0: 1.0, 1: 2.0} for label in labels}
+            assert condition.decide(scores)[0] != "not run", (figure.name, condition.text)
+
+
+def test_the_table_prints_what_the_paper_prints():
+    table = figures()["table_sac"]
+    assert table.printed["ours with warm-up, exploration's settings"] == "11269 +- 395"
+    assert {cell.label for cell in table.parts[0].cells} == set(table.printed)
+    (cell,) = [one for one in table.parts[0].cells if one.label == "sac, exploration's settings"]
+    sac = config_of(cell, "paper").explorer.task_sac
+    assert (sac.lr, sac.batch_size, sac.alpha, sac.reward_scale) == (1e-3, 4096, 0.02, 1.0)
+
+
+def test_without_a_warm_up_is_as_short_as_can_be():
+    (cell,) = [one for one in figures()["transfer_cold"].parts[0].cells if one.label == "sac"]
+    config = config_of(cell, "paper")
+    if "warm_up" in {item.name for item in dataclasses.fields(RunConfig)}:
+        assert getattr(config, "warm_up") == "none"  # noqa: B009
+        assert config.explorer.warm_up_steps == 0
+    else:
+        assert config.explorer.warm_up_steps == 1

@@ -1,0 +1,204 @@
+"""The paper from one command: what it refuses, what it plans, and one small figure from the runs to the page."""
+
+import contextlib
+import io
+import json
+import os
+import re
+import subprocess
+import sys
+import urllib.request
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from experiments import paper
+from experiments.runs import lock
+from experiments.runs.directory import RunDirectory
+from experiments.runs.status import Status
+from experiments.studies import figures_of_paper, plan
+from experiments.studies.figures_of_paper import Cell
+from tests.experiments.studies import by_hand
+from tests.experiments.tiny import ROOT
+
+STEPS = dict.fromkeys(("smoke", "laptop", "paper"), 100)
+WARM_UP = {"explorer": {"warm_up_steps": 50}}
+
+
+class Told(NamedTuple):
+    status: int
+    stdout: str
+    stderr: str
+
+
+def tell(*words: str) -> Told:
+    stdout, stderr = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(stdout), contextlib.redirect_stderr(stderr):
+        try:
+            status = paper.main(words)
+        except SystemExit as stop:
+            status = int(stop.code or 0)
+    return Told(status, stdout.getvalue(), stderr.getvalue())
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> str:
+    """The only figure: random actions in the acrobot and in the mountain car, which compile in no time."""
+    cells = tuple(
+        Cell(label, "acrobot", "random", 2, STEPS, {**WARM_UP, "obs_noise": noise})
+        for label, noise in (("still", 0.0), ("noisy", 0.1))
+    )
+    monkeypatch.setattr(figures_of_paper, "figures", lambda: {"small": by_hand.figure("small", cells)})
+    monkeypatch.setattr(paper, "KEPT", Path("no such place"))
+    return "small"
+
+
+def test_one_figure_from_the_runs_to_the_page(small: str, tmp_path: Path):
+    out = tmp_path / "out"
+    words = (small, "--preset=smoke", f"--out={out}")
+    planned = tell(*words, "--dry-run")
+    assert planned.status == 0 and "2 runs, 0 of them finished" in planned.stdout
+    assert not out.exists()
+    first = tell(*words)
+    assert first.status == 0, first.stderr
+    assert re.search(r"small +undecided", first.stdout)
+    runs = sorted((out / plan.RUNS).iterdir())
+    assert [RunDirectory(run).status() for run in runs] == [Status.FINISHED] * 2
+    assert all(json.loads((run / "config.json").read_text())["num_seeds"] == 2 for run in runs)
+    text = (out / "report.md").read_text()
+    assert "| `still` | 0 to 1 |" in text and "| `noisy` | 0 to 1 |" in text
+    # Again, nothing is left to be done, and the runs stay as they are.
+    before = {run: (run / "metrics.jsonl").read_bytes() for run in runs}
+    again = tell(*words)
+    assert again.status == 0 and "0 of them left" in again.stderr
+    assert {run: (run / "metrics.jsonl").read_bytes() for run in runs} == before
+    assert "2 of them finished" in tell(*words, "--dry-run").stdout
+    # A run that is there already is not made again.
+    other = (small, "--preset=smoke", f"--out={tmp_path / 'other'}", f"--runs={out / plan.RUNS}")
+    assert "2 of them finished" in tell(*other, "--dry-run").stdout
+    assert tell(*other).status == 0
+    assert not list((tmp_path / "other" / plan.RUNS).iterdir())
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["chian"], "FIGURE='chian' is not known. Did you mean 'chain'? Allowed: acrobot, "),
+        (["chain", "--preset=labtop"], "--preset='labtop' is not known. Did you mean 'laptop'? Allowed: "),
+        (["chain", "--executor=slrum"], "--executor='slrum' is not known. Did you mean 'slurm'? Allowed: "),
+        (["chain", "--runs=nowhere"], "--runs='nowhere' is none. Allowed: a directory of runs."),
+        (["chain", "--port=70000"], "--port=70000 is out of range. Allowed: a whole number, 0 to 65535."),
+        (["chain", "--every=0"], "--every=0.0"),
+        (["chain", "--import=no_such"], "--import=no_such: cannot import it"),
+        (["chain", "--report"], "--report: no run of these figures is finished in --out="),
+    ],
+)
+def test_bad_input_is_one_line_and_writes_nothing(
+    words: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(tmp_path)
+    told = tell(*words)
+    assert told.status == 2
+    assert told.stderr.startswith(f"error: {message}") and told.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("name", "package"), [("slurm", "submitit"), ("ray", "ray")])
+def test_an_executor_without_its_package(
+    name: str, package: str, small: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setitem(sys.modules, package, None)
+    told = tell(small, f"--executor={name}", f"--out={tmp_path / 'out'}")
+    assert told.status == 2 and told.stderr.count("\n") == 1
+    assert f'--executor={name} needs {package}. What to do: pip install -e ".[{name}]"' in told.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_plan_larger_than_the_disk(small: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    usage = plan.shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(plan.shutil, "disk_usage", lambda path: usage._replace(free=2**20))
+    told = tell(small, f"--out={tmp_path / 'out'}")
+    assert told.status == 2 and "GiB of disk at the most" in told.stderr and told.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_what_lies_there_is_not_overwritten(small: str, tmp_path: Path):
+    (tmp_path / "index.html").write_text("mine")
+    told = tell(small, f"--out={tmp_path}")
+    assert told.status == 2 and "holds other files (index.html)" in told.stderr
+    assert (tmp_path / "index.html").read_text() == "mine" and len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_second_planner_is_told_of_the_first(small: str, tmp_path: Path):
+    with lock.claimed(tmp_path / "out"):
+        told = tell(small, "--preset=smoke", f"--out={tmp_path / 'out'}")
+    assert told.status == 1 and "belongs to process" in told.stderr
+
+
+def test_only_the_report(small: str, tmp_path: Path):
+    out = tmp_path / "out"
+    figure = figures_of_paper.figures()[small]
+    made = plan.make([figure], "smoke", out)
+    plan.write_settings(made, plan.look_all(made))
+    by_hand.finish(next(iter(made.jobs.values())))
+    told = tell(small, "--preset=smoke", f"--out={out}", "--report")
+    assert told.status == 0, told.stderr
+    assert "| `still` |" in (out / "report.md").read_text()
+    assert len(list((out / plan.RUNS).iterdir())) == 1
+
+
+def test_a_failed_run_is_an_error_and_the_rest_is_reported(small: str, tmp_path: Path):
+    out = tmp_path / "out"
+    made = plan.make([figures_of_paper.figures()[small]], "smoke", out)
+    plan.write_settings(made, plan.look_all(made))
+    first, second = made.jobs.values()
+    by_hand.finish(first)
+    second.path.mkdir()
+    (second.path / "thesis.tex").write_text("")
+    told = tell(small, "--preset=smoke", f"--out={out}")
+    assert told.status == 1
+    assert f"error: {second.name} is not finished: {second.path} holds other files than a run" in told.stderr
+    assert "| `still` |" in (out / "report.md").read_text()
+
+
+def test_watching_serves_the_page_while_the_plan_runs(small: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    seen, out = [], tmp_path / "out"
+    made = plan.make([figures_of_paper.figures()[small]], "smoke", out)
+
+    def carry_out(plan_, standings, executor, tell):
+        for job in made.jobs.values():
+            by_hand.finish(job)
+            tell(plan.look_all(made), [], {}, 0)
+            address = f"http://127.0.0.1:{ports[0]}/report.md"
+            with urllib.request.urlopen(address) as answer:
+                seen.append(answer.read().decode())
+        return paper.conduct.Outcome(plan.look_all(made), {})
+
+    ports: list[int] = []
+    serve = paper.watch.serve
+
+    @contextlib.contextmanager
+    def noting(directory: Path, port: int):
+        with serve(directory, port) as address:
+            ports.append(int(address.split(":")[2].split("/")[0]))
+            yield address
+
+    monkeypatch.setattr(paper.conduct, "carry_out", carry_out)
+    monkeypatch.setattr(paper.watch, "serve", noting)
+    told = tell(small, "--preset=smoke", f"--out={out}", "--watch", "--every=1e-9")
+    assert told.status == 0, told.stderr
+    assert f"http://127.0.0.1:{ports[0]}/index.html" in told.stderr
+    assert "1 of 2 runs are finished" in seen[0] and "2 of 2 runs are finished" in seen[1]
+
+
+@pytest.mark.slow
+def test_the_whole_paper_with_the_smoke_preset(tmp_path: Path):
+    command = [sys.executable, "-m", "experiments.paper", "--preset=smoke", f"--out={tmp_path / 'out'}"]
+    # As a user's command: the tests' own switches for JAX are the same as the smoke preset's.
+    done = subprocess.run(command, cwd=ROOT, env={**os.environ}, capture_output=True, text=True, timeout=3_600)
+    assert done.returncode == 0, done.stderr
+    text = (tmp_path / "out" / "report.md").read_text()
+    for name, figure in figures_of_paper.figures().items():
+        assert figure.title in text and re.search(rf"(?m)^{name} +(holds|does not hold|undecided)$", done.stdout), name
+    assert "not run" not in done.stdout
