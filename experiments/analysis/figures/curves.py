@@ -130,7 +130,7 @@ def plot_return(path: str | os.PathLike[str], curves: Sequence[Curves], *, title
             lambda group: name_of(group, curves).replace("median", "mean"),
         )
         for axes, own, _ in panels:
-            bold = [line for line in axes.get_lines() if not line.get_label().startswith("_")]
+            bold = [line for line in axes.get_lines() if not str(line.get_label()).startswith("_")]
             for line, group in zip(bold, own, strict=True):
                 low, high = _t_bounds(group.values)
                 axes.fill_between(group.steps, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
