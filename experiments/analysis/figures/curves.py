@@ -127,7 +127,7 @@ def plot_return(path: str | os.PathLike[str], curves: Sequence[Curves], *, title
         draw_lines(
             panels,
             lambda group: np.mean(group.values, axis=0),
-            lambda group: name_of(group, curves).replace("median", "mean"),
+            lambda group: name_of(group, curves, "mean"),
         )
         for axes, own, _ in panels:
             bold = [line for line in axes.get_lines() if not str(line.get_label()).startswith("_")]
@@ -136,7 +136,7 @@ def plot_return(path: str | os.PathLike[str], curves: Sequence[Curves], *, title
                 axes.fill_between(group.steps, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
             axes.grid(axis="y", color="#e4e4e4", linewidth=0.7)
             axes.set_axisbelow(True)
-        finish(path, figure, panels, quantity="return", title=title)
+        finish(path, figure, panels, quantity="return", title=title, middle="mean")
 
 
 def _t_bounds(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
