@@ -11,11 +11,12 @@ import jax
 from envs.base import Environment
 from experiments import process, runtime
 from experiments.analysis import report
-from experiments.runs import place
+from experiments.runs import flags, place
 from experiments.runs.command import PROGRAM, CommandLine, check_read, parse
-from experiments.runs.config import RunConfig, flag, path_of
+from experiments.runs.config import RunConfig, check_room, flag, path_of
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
+from experiments.runs.inherit import inherit
 from experiments.runs.seeds import SeedRuns
 from experiments.runs.spec import RunSpec
 from experiments.runs.status import Status
@@ -42,19 +43,22 @@ def main(argv: Sequence[str] | None = None, *, is_command: bool = False) -> int:
     try:
         try:
             command, spec = parse(argv)
+            resumes = command.resume and place.is_there(command.out)
+            if command.config is None and not resumes:
+                spec = inherited(spec, argv)
             if command.version:
                 print("\n".join(f"{name} {version}" for name, version in runtime.versions().items()))
                 return 0
             if command.processes > 1 or (command.resume and SeedRuns(command.out or "").exists()):
                 runtime.share_device()
-            env, agent, spec = prepare(spec, resume=command.resume)
+            env, agent, spec = prepare(spec, resume=resumes)
             check_read(argv, spec.config, build.sizes_of(env))
             split = seeds.are_split(command, spec, env, is_command=is_command)
             chosen = place.choose(command.out, spec, resume=command.resume)
             ready = (
                 seeds.plan(command, spec, env, agent)
                 if split
-                else make_programs_that_fit(spec.config, env, agent, resume=command.resume)
+                else make_programs_that_fit(spec.config, env, agent, resume=resumes)
             )
         except (ValueError, RunError) as error:
             print(f"error: {error}", file=sys.stderr)
@@ -75,6 +79,18 @@ def main(argv: Sequence[str] | None = None, *, is_command: bool = False) -> int:
         return process.status_of(stop)
 
 
+def inherited(spec: RunSpec, argv: Sequence[str]) -> RunSpec:
+    """A run with what its parent decides on, where no flag does.
+
+    Raises:
+        ValueError: what is left of the steps does not go with a flag; names that.
+    """
+    try:
+        return inherit(spec, flags.given(argv))
+    except FieldError as error:
+        raise ValueError(error.spell(flag(error.field))) from error
+
+
 def prepare(spec: RunSpec, *, resume: bool) -> tuple[Environment, Explorer, RunSpec]:
     """Environment and agent, which refuse what they cannot do when they are built: before anything is written.
 
@@ -92,7 +108,7 @@ def prepare(spec: RunSpec, *, resume: bool) -> tuple[Environment, Explorer, RunS
         spec = dataclasses.replace(spec, config=dataclasses.replace(spec.config, backend=env.backend))
         agent = build.make_agent(spec.config, env)
         if spec.parent is not None and not resume and not SeedRuns(spec.parent.directory).exists():
-            spec = dataclasses.replace(spec, parent=parent.resolve(spec.parent, env, agent))
+            spec = dataclasses.replace(spec, parent=parent.resolve(spec.parent, env, agent, spec.config))
         return env, agent, spec
     except FieldError as error:
         path = "parent" if error.field == "parent" else path_of(spec.config, error)
@@ -100,11 +116,14 @@ def prepare(spec: RunSpec, *, resume: bool) -> tuple[Environment, Explorer, RunS
 
 
 def make_programs_that_fit(config: RunConfig, env: Environment, agent: Explorer, *, resume: bool) -> Programs:
-    """The programs of a run. One that does not fit into memory is refused; what is resumed has fitted before.
+    """The programs of a run. One that does not fit into memory, or whose replay does not hold its steps, is refused;
+    what is resumed has fitted before.
 
     Raises:
         ValueError: it does not fit; names the sizes.
     """
+    if not resume:
+        check_room(config)
     memory.check_steps(config)
     programs = make_programs(config, env, agent)
     if not resume:
@@ -135,8 +154,9 @@ def carry_out(
     else:
         last = config.seed + config.num_seeds - 1
         which = f"seed {config.seed}" if config.num_seeds == 1 else f"seeds {config.seed} to {last}"
+        after = f" after {spec.parent.steps:,} of {spec.parent}" if spec.parent else ""
         print(
-            f"{config.method} on {config.env}: {config.preset} preset, {which}, {config.steps:,} steps\n"
+            f"{config.method} on {config.env}: {config.preset} preset, {which}, {config.steps:,} steps{after}\n"
             f"physics: {env.backend}, learning: {jax.devices()[0].device_kind}\n"
             f"writing to {directory}",
             flush=True,

@@ -30,11 +30,13 @@ TASK_SAC = SACConfig(
     batch_size=256,
     alpha=1.0,
     reward_scale=5.0,
+    log_std_map="clip",
     policy_penalty=0.0,
     grad_clip=1e6,
 )
-"""SAC as its authors run it on the half cheetah (haarnoja/sac), which are the paper's settings; but the policy seeks
-the smaller of both action values, where haarnoja/sac takes the first."""
+"""SAC as its authors run it on the half cheetah (haarnoja/sac), which are the paper's settings: ReLU, Xavier's uniform
+weights, a standard deviation of 1 at the start, nothing added to the policy's loss, no gradient clipped. But the policy
+seeks the smaller of both action values, where haarnoja/sac takes the first."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +44,12 @@ class ExplorationConfig:
     """Every setting of a method and of the loop around it. The defaults are the paper's."""
 
     warm_up_steps: int = 256
-    """Uniform random actions before the first round. nnaisense/max: 256."""
+    """Steps before the first round, by uniform actions unless a run says otherwise. 0: the first round comes with its
+    first steps. nnaisense/max: 256."""
     steps_per_round: int = 25
     """Real steps between two rounds. nnaisense/max: 25."""
     data_capacity: int = 10_001
-    """Real transitions kept. nnaisense/max: the number of steps, plus one."""
+    """Real transitions kept; the oldest make room for more. nnaisense/max: the number of steps, plus one."""
     reward_units: RewardUnits = "normalized"
     """Units of the variance reward: normalised delta, or the observation's own (`raw`)."""
     error_units: ErrorUnits = "obs"
@@ -80,8 +83,8 @@ class ExplorationConfig:
 
     def __post_init__(self) -> None:
         checks = Checks(self)
-        for name in ("warm_up_steps", "steps_per_round"):
-            checks.at_least(name, 1)
+        checks.at_least("warm_up_steps", 0)
+        checks.at_least("steps_per_round", 1)
         checks.at_least("data_capacity", self.steps_per_round)
         checks.one_of("reward_units", get_args(RewardUnits))
         checks.one_of("error_units", get_args(ErrorUnits))

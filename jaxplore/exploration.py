@@ -36,6 +36,8 @@ class ExplorerState:
     data: Replay[Transition]
     """Real transitions."""
     normalizers: Normalizers
+    frozen: Array
+    """Whether the normalisers stay as they are, as a policy that was taken over needs them; bool."""
     signal: Any = ()
     """What the signal carries beside the belief, unless the behaviour carries it."""
 
@@ -80,8 +82,9 @@ class Explorer(NamedTuple):
     entry, where 1 is as good as predicting the mean change; or per probability."""
     adopt: Callable[[ExplorerState, Actor], ExplorerState] | None
     """`adopt(state, actor) -> state`: with the policy of another agent's actor and the statistics that it sees
-    observations by; what is learned with it, such as critics, is new, and there are no data. None: the method has no
-    policy that could be taken over."""
+    observations by, which stay as they are from now on, whatever comes: its weights mean nothing by others. What is
+    learned with it, such as critics, is new, and there are no data. None: the method has no policy that could be taken
+    over."""
     reward_unit: str | None
     """Of the intrinsic reward, for labels. None: the method has no intrinsic reward."""
 
@@ -170,6 +173,7 @@ def init(agent: Agent, key: Key) -> ExplorerState:
         behaviour=agent.behaviour.init(behaviour_key),
         data=replay.init(example, agent.data_capacity),
         normalizers=dynamics.init_normalizers(sizes.obs, sizes.action),
+        frozen=jnp.zeros((), bool),
         signal=own,
     )
 
@@ -180,10 +184,11 @@ def actor(agent: Agent, state: ExplorerState, uniform: bool | Array = False) -> 
 
 
 def adopt(agent: Agent, state: ExplorerState, actor: Actor) -> ExplorerState:
-    """The state with another agent's policy and normalisers."""
+    """The state with another agent's policy and normalisers, which are frozen."""
     assert agent.behaviour.adopt is not None
     behaviour = agent.behaviour.adopt(state.behaviour, actor.behaviour)
-    return dataclasses.replace(state, behaviour=behaviour, normalizers=actor.normalizers)
+    frozen = jnp.ones_like(state.frozen)
+    return dataclasses.replace(state, behaviour=behaviour, normalizers=actor.normalizers, frozen=frozen)
 
 
 def act(agent: Agent, key: Key, actor: Actor, obs: Array) -> Array:
@@ -208,11 +213,9 @@ def act_uniformly(agent: Agent, key: Key, obs: Array) -> Array:
 
 def observe(state: ExplorerState, transitions: Transition, valid: Array) -> ExplorerState:
     """Take real transitions `[T, ...]` in where `valid [T]` is set; nothing is learned yet."""
-    return dataclasses.replace(
-        state,
-        data=replay.add(state.data, transitions, valid),
-        normalizers=dynamics.update_normalizers(state.normalizers, transitions, valid),
-    )
+    updated = dynamics.update_normalizers(state.normalizers, transitions, valid)
+    normalizers = jax.tree.map(lambda new, old: jnp.where(state.frozen, old, new), updated, state.normalizers)
+    return dataclasses.replace(state, data=replay.add(state.data, transitions, valid), normalizers=normalizers)
 
 
 def improve(agent: Agent, key: Key, state: ExplorerState, obs: Array, num_data: Array) -> tuple[ExplorerState, Metrics]:

@@ -98,6 +98,11 @@ def as_sac_v2(config: ExplorationConfig) -> ExplorationConfig:
     )
 
 
+def as_explorer(config: ExplorationConfig) -> ExplorationConfig:
+    """SAC at the task with all settings that explorers have: the exploration column of the paper's table."""
+    return dataclasses.replace(config, task_sac=config.sac)
+
+
 def as_baselines_default(config: ExplorationConfig) -> ExplorationConfig:
     """DDPG's networks as openai/baselines has them where nothing is set, so perhaps as the paper ran them."""
     return dataclasses.replace(config, ddpg=dataclasses.replace(config.ddpg, layer_norm=False, activation="tanh"))
@@ -253,6 +258,14 @@ METHODS: dict[str, Method] = {
         needs_reward=True,
         actions="continuous",
         settings=as_sac_v2,
+    ),
+    "sac_explorer": Method(
+        "SAC with the settings that it explores with (nnaisense/max's) on the environment's own reward",
+        task_reward,
+        model_free_sac,
+        needs_reward=True,
+        actions="continuous",
+        settings=as_explorer,
     ),
     "random": Method("uniform random actions", task_reward, uniform_actions),
 }

@@ -116,6 +116,14 @@ class MLP(nn.Module):
         return outputs[0] if self.num_outputs == 1 else outputs
 
 
+LOG_STD_MAPS: dict[str, Callable[[Array, float, float], Array]] = {
+    "tanh": lambda head, low, high: low + 0.5 * (high - low) * (jnp.tanh(head) + 1.0),
+    "clip": lambda head, low, high: jnp.clip(head, low, high),
+}
+"""From a policy's head to its log standard deviation, within bounds. `tanh` has a gradient everywhere and starts in the
+middle between them (nnaisense/max, `sac.py`); `clip` is the head itself, which starts at 0 (haarnoja/sac)."""
+
+
 class GaussianParams(NamedTuple):
     """A diagonal Gaussian before the squash."""
 
@@ -128,8 +136,10 @@ class GaussianParams(NamedTuple):
 class TanhGaussianPolicy(nn.Module):
     """Network of a tanh-squashed diagonal Gaussian policy: `[..., O] -> GaussianParams` of `[..., A]`.
 
-    The log standard deviation is a smooth function of its head, `low + (high - low) / 2 * (tanh(head) + 1)`, so that
-    it stays in `log_std_bounds` with a gradient everywhere (nnaisense/max, `sac.py`).
+    How its head becomes the log standard deviation, within `log_std_bounds`, is one of `LOG_STD_MAPS`.
+
+    Raises:
+        ValueError: unknown `log_std_map`, naming the nearest match.
     """
 
     hidden: tuple[int, ...]
@@ -137,6 +147,11 @@ class TanhGaussianPolicy(nn.Module):
     activation: str = "leaky_relu"
     init_name: str = "orthogonal"
     log_std_bounds: tuple[float, float] = (-20.0, 2.0)
+    log_std_map: str = "tanh"
+
+    def __post_init__(self) -> None:
+        validate.one_of("log_std_map", self.log_std_map, LOG_STD_MAPS)
+        super().__post_init__()
 
     @nn.compact
     def __call__(self, obs: Array) -> GaussianParams:
@@ -144,8 +159,7 @@ class TanhGaussianPolicy(nn.Module):
         inits = self.init_name, self.init_name
         mlp = MLP(self.hidden, 2 * self.action_size, self.activation, *inits, num_outputs=2, name="mlp")
         mean, head = mlp(obs)
-        low, high = self.log_std_bounds
-        return GaussianParams(mean, low + 0.5 * (high - low) * (jnp.tanh(head) + 1.0))
+        return GaussianParams(mean, LOG_STD_MAPS[self.log_std_map](head, *self.log_std_bounds))
 
 
 def sample_tanh_gaussian(key: Key, params: GaussianParams) -> tuple[Array, Array]:

@@ -60,6 +60,7 @@ def write(
     tables = [
         coverage_table(groups, scene.coverage),
         paired_table(groups, against),
+        return_table(groups),
         belief_table(groups),
         calibration_table(groups),
     ]
@@ -71,6 +72,9 @@ def write(
 def _draw(groups: Sequence[Group], scene: Scene, env: str, out: Path) -> None:
     curves = [figures.Curves(one.label, one.steps, one.coverage) for one in groups]
     figures.plot_coverage(out / "coverage.png", curves, scene.coverage, episode_steps=scene.episode_steps, title=env)
+    earned = [figures.Curves(one.label, one.evaluated, one.returns) for one in groups if len(one.evaluated)]
+    if earned:
+        figures.plot_return(out / "return.png", earned, title=f"{env}: return of evaluations without exploring")
     known = [figures.Curves(one.label, one.steps, one.variance) for one in groups if np.isfinite(one.variance).any()]
     if known:
         figures.plot_intrinsic_reward(
@@ -126,6 +130,22 @@ def paired_table(groups: Sequence[Group], against: str) -> str | None:
             line.append(_bounds(chance, ".2f", min(len(heights), len(others))))
         lines.append(line)
     return markdown_table(head, lines) if len(groups) > 1 else None
+
+
+def return_table(groups: Sequence[Group]) -> str | None:
+    """A Markdown table of the mean returns of the last evaluations; None where there was none."""
+    lines = []
+    for one in groups:
+        finals = [outcome.final_return for outcome in one.outcomes if outcome.final_return is not None]
+        if not finals:
+            continue
+        mean, half_width = interval(np.array(finals))
+        error = "" if half_width is None else f" +- {half_width:,.1f}"
+        each = ", ".join(f"{value:,.1f}" for value in finals)
+        last = f"{one.evaluated[-1]:,}" if len(one.evaluated) else "-"
+        lines.append((f"`{one.label}`", str(len(finals)), f"{mean:,.1f}{error}", each, last))
+    head = ("method", "seeds", "final return: mean, 95 %", "each seed", "at step, parents' counted")
+    return markdown_table(head, lines) if lines else None
 
 
 def belief_table(groups: Sequence[Group]) -> str | None:

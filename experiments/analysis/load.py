@@ -18,24 +18,29 @@ from jaxplore.validate import FieldError
 
 
 class LoadedRun(NamedTuple):
-    """A run, or its first steps as if it had ended there."""
+    """A run, or its first steps as if it had ended there. Steps count those of its parents."""
 
     directory: RunDirectory
     config: RunConfig
     rows: list[dict[str, Any]]
     scene: Scene
+    before: int = 0
+    """Steps of its parents, which are counted in `config.steps` and in every row."""
 
 
 def load(path: Path, until: int | None = None) -> LoadedRun:
-    """A finished run, or its first `until` steps.
+    """A finished run, or its first `until` steps, those of its parents included.
 
     Raises:
         RunError: `path` holds no run, or one that has not come that far.
         ValueError: its configuration is damaged.
     """
     directory = RunDirectory(path)
-    config, rows = directory.config(), directory.rows()
-    wanted = until or config.steps
+    spec, rows = directory.spec(), directory.rows()
+    config, before = spec.config, spec.parent.steps if spec.parent else 0
+    if until is not None and until <= before:
+        raise RunError(f"{path} begins after {before} steps of its parents. Compare with --until={before + 1} or more.")
+    wanted = until - before if until else config.steps
     last = max((row["step"] for row in rows), default=0)
     status = directory.status()
     if status is Status.DIVERGED and last < wanted:
@@ -57,10 +62,8 @@ def load(path: Path, until: int | None = None) -> LoadedRun:
                 f"{directory.metrics_path}, step {row['step']} of seed {row['seed']}: {error} What to do: put back a "
                 "copy of the file."
             ) from error
-    if until is None:
-        return LoadedRun(directory, config, rows, scene)
-    rows = [row for row in rows if row["step"] <= until]
-    return LoadedRun(directory, dataclasses.replace(config, steps=until), rows, scene)
+    rows = [{**row, "step": row["step"] + before} for row in rows if row["step"] <= wanted]
+    return LoadedRun(directory, dataclasses.replace(config, steps=wanted + before), rows, scene, before)
 
 
 def scene_of(directory: RunDirectory) -> Scene:

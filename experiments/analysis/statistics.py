@@ -37,6 +37,8 @@ class Outcome(NamedTuple):
     """What `experiments.calibrate` found of this seed at this step, if it was asked."""
     last_return: float | None
     """Of the last episode that ended; None: no task, or no episode ended."""
+    final_return: float | None = None
+    """Mean of the last evaluation; None: there was none."""
 
 
 class Group(NamedTuple):
@@ -50,6 +52,10 @@ class Group(NamedTuple):
     """`[S, T]`, 0 to 1."""
     variance: np.ndarray
     """Equation 1 on the transitions just met, whatever the method's own reward, `[S, T]`; NaN without a belief."""
+    evaluated: np.ndarray
+    """Steps of the evaluations, `[E]`; empty where a seed has none."""
+    returns: np.ndarray
+    """Mean return of each evaluation, the last that there was, `[S, E]`."""
 
     @property
     def heights(self) -> dict[int, float]:
@@ -62,25 +68,47 @@ def outcomes(run: LoadedRun) -> list[Outcome]:
     """What became of each seed of a run."""
     config, rows, found = run.config, run.rows, []
     calibrated = run.directory.calibration() or {"step": None, "seeds": []}
-    asked = {one["seed"]: one for one in calibrated["seeds"]} if calibrated["step"] == config.steps else {}
+    own_steps = config.steps - run.before
+    asked = {one["seed"]: one for one in calibrated["seeds"]} if calibrated["step"] == own_steps else {}
     for seed in range(config.seed, config.seed + config.num_seeds):
         own = [row for row in rows if row["seed"] == seed]
         cells = own[-1]["cells"]
         reached = tuple(next(row["step"] for row in own if row["cells"] >= count) for count in range(1, cells + 1))
-        late = [row for row in own if 2 * row["step"] > config.steps]
+        late = [row for row in own if 2 * (row["step"] - run.before) > own_steps]
         measures = {name: [row[name] for row in late if row.get(name) is not None] for name in MEASURES}
         means = {name: float(np.mean(values)) for name, values in measures.items() if values}
         minutes = own[-1]["wall_time"] / 60 / config.num_seeds
         returns = [row["episode_return"] for row in own if row.get("episode_return") is not None]
         last_return = returns[-1] if returns else None
-        found.append(Outcome(seed, cells, reached, minutes, means, asked.get(seed), last_return))
+        evaluated = [row["eval/return"] for row in own if row.get("eval/return") is not None]
+        final = evaluated[-1] if evaluated else None
+        found.append(Outcome(seed, cells, reached, minutes, means, asked.get(seed), last_return, final))
     return found
+
+
+def _parents(run: LoadedRun) -> str:
+    return f" ({run.before} of them its parents')" if run.before else ""
+
+
+def evaluations(runs: Sequence[LoadedRun]) -> tuple[np.ndarray, np.ndarray]:
+    """Evaluations of all seeds of some runs, on common steps: `(steps [E], returns [S, E])`, where a seed has none its
+    last one. They begin where all seeds have one; without any in one of the runs there are none.
+    """
+    told = [series([row for row in run.rows if row.get("eval/return") is not None], "eval/return") for run in runs]
+    num_seeds = sum(run.config.num_seeds for run in runs)
+    if not all(len(steps) for steps, _ in told) or sum(len(values) for _, values in told) < num_seeds:
+        return np.zeros(0, int), np.zeros((num_seeds, 0))
+    steps = np.unique(np.concatenate([steps for steps, _ in told]))
+    steps = steps[steps >= max(own[0] for own, _ in told)]
+    at = [np.searchsorted(own, steps, side="right") - 1 for own, _ in told]
+    return steps, np.concatenate([held(values)[:, index] for (_, values), index in zip(told, at, strict=True)])
 
 
 def group(
     runs: Sequence[Path], until: int | None = None, names: Sequence[str | None] | None = None
 ) -> tuple[LoadedRun, list[Group]]:
-    """The runs by name, in the order in which the names come; of each the first `until` steps, or all.
+    """The runs by name, in the order in which the names come; of each the first `until` steps, or all. Steps count
+    those of a run's parents.
 
     Args:
         runs: directories.
@@ -108,7 +136,7 @@ def group(
             config = run.config
             if (config.env, config.steps) != (first.env, first.steps):
                 raise RunError(
-                    f"{path} is of {config.env} over {config.steps} steps, "
+                    f"{path} is of {config.env} over {config.steps} steps{_parents(run)}, "
                     f"{runs[0]} of {first.env} over {first.steps}. "
                     "Compare runs of one environment and one length."
                 )
@@ -125,5 +153,6 @@ def group(
                 f"{label}: seed {statistics.mode(seeds)} comes twice. Give each seed of a method once, "
                 "or NAME=RUN to compare settings."
             )
-        groups.append(Group(label, own, grid, np.concatenate(curves), np.concatenate(variances)))
+        evaluated = evaluations([run for name, run in zip(named, loaded, strict=True) if name == label])
+        groups.append(Group(label, own, grid, np.concatenate(curves), np.concatenate(variances), *evaluated))
     return loaded[0], groups

@@ -20,7 +20,7 @@ import logging
 import os
 import shutil
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -54,16 +54,22 @@ class Checkpoints:
     Args:
         directory: where they lie; made by the first `save`.
         keep: how many of the newest are kept.
+        keep_at: steps whose checkpoints are kept beside them, for good.
         warn: gets a sentence about every checkpoint that could not be used. Default: prints to stderr.
     """
 
     def __init__(
-        self, directory: str | os.PathLike[str], *, keep: int = 2, warn: Callable[[str], None] | None = None
+        self,
+        directory: str | os.PathLike[str],
+        *,
+        keep: int = 2,
+        keep_at: Collection[int] = (),
+        warn: Callable[[str], None] | None = None,
     ) -> None:
         if keep < 1:
             raise ValueError(f"keep: must be at least 1, got {keep}")
         self.directory = Path(directory).absolute()
-        self._keep = keep
+        self._keep, self._keep_at = keep, frozenset(keep_at)
         self._warn = warn or (lambda text: print(text, file=sys.stderr))
 
     def steps(self) -> list[int]:
@@ -76,7 +82,8 @@ class Checkpoints:
             raise disk_error("look for checkpoints", self.directory, error) from error
 
     def save(self, step: int, state: Any, meta: dict[str, Any] | None = None) -> None:
-        """Saves a state; when this returns it is on the disk, and the `keep` newest checkpoints are all that is left.
+        """Saves a state; when this returns it is on the disk, and the `keep` newest checkpoints are all that is left,
+        beside those of `keep_at`.
 
         Args:
             step: names the checkpoint. One of the same step is replaced; later ones are of a future that was given up
@@ -115,7 +122,8 @@ class Checkpoints:
             raise disk_error(f"write the checkpoint of step {step}", self.directory, error, then) from error
         try:
             for old in self.steps()[: -self._keep]:
-                self._discard(self.directory / str(old))
+                if old not in self._keep_at:
+                    self._discard(self.directory / str(old))
         except OSError as error:
             self._warn(f"cannot remove old checkpoints in {self.directory}: {error.strerror}")
 

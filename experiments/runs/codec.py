@@ -18,8 +18,8 @@ class Allowances(NamedTuple):
     newer: Mapping[str, Any] = {}
     """Leaves that a state saved by an older version lacks, and the number that they are then full of."""
     longer: Collection[str] = ()
-    """NumPy leaves that may be shorter along their second axis, and are then filled up with zeros: a run that goes
-    on for more steps than it was begun for."""
+    """Leaves that may be shorter along their second axis, and are then filled up with zeros: a run that goes on for
+    more steps than it was begun for."""
 
 
 NONE = Allowances()
@@ -91,9 +91,10 @@ def decode(
         )
     leaves = {name: np.full(like[name].shape, allowed.newer[name], like[name].dtype) for name in absent}
     for name, record in records.items():
-        leaf = record["value"] if record["kind"] == "python" else _rebuild(name, record, arrays[name], like[name])
-        if name in allowed.longer:
-            leaf = _lengthen(leaf, np.shape(like[name]))
+        array = arrays.get(name)
+        if array is not None and name in allowed.longer:
+            array = _lengthen(array, np.shape(like[name]))
+        leaf = record["value"] if array is None else _rebuild(name, record, array, like[name])
         if np.shape(leaf) != np.shape(like[name]) or _dtype(leaf) != _dtype(like[name]):
             raise Misfit(
                 f"{name} is {_dtype(leaf)}{list(np.shape(leaf))} there and "

@@ -2,7 +2,7 @@
 
 import dataclasses
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,8 +37,10 @@ class CommandLine:
     config: str | None = None
     """A config.json to start from, as every run saves it; other flags come on top."""
     parent: str | None = None
-    """Start from the policy of another run: DIRECTORY or DIRECTORY@STEP (by default its latest checkpoint). Its
-    observation statistics come with it; critics are new and there are no data. For methods on the task's reward."""
+    """Start from the policy of another run: DIRECTORY, once it is finished, or DIRECTORY@STEP, any checkpoint of it.
+    With it come the form of its network and its observation statistics, which stay as they are; critics are new and
+    there are no data. --steps are this run's own; without it they are the preset's less those that the parent took.
+    For methods on the task's reward."""
     wandb: str | None = None
     """Also log to this project of Weights & Biases; WANDB_MODE=offline keeps it on this machine."""
     processes: int = 0
@@ -102,14 +104,31 @@ def parse(argv: Sequence[str]) -> tuple[CommandLine, RunSpec]:
             "as cores and memory allow."
         )
     paths = {name: command[name] or None for name in ("out", "config", "parent", "wandb")}
+    imports = tuple(dict.fromkeys((*start.imports, *named)))
     try:
         ref = RunRef.parse(paths["parent"]) if paths["parent"] else start.parent
-        config: RunConfig = replace(start.config, changes)
+        config: RunConfig = with_room(replace(start.config, changes), given=flags.given(argv))
+        _check_warm_up(config, changes["explorer"]["warm_up_steps"], flags.given(argv))
         check_read(argv, config)
+        spec = RunSpec(config, ref, imports)
     except FieldError as error:
         raise ValueError(error.spell(flag(error.field))) from error
-    imports = tuple(dict.fromkeys((*start.imports, *named)))
-    return CommandLine(**{**command, **paths}), RunSpec(config, ref, imports)
+    return CommandLine(**{**command, **paths}), spec
+
+
+def with_room(config: RunConfig, given: Collection[str]) -> RunConfig:
+    """A configuration whose replay holds all steps, where a person has said how many there are (`given`, names of
+    flags), and not how many it holds.
+    """
+    if "steps" not in given or "data_capacity" in given or config.explorer.data_capacity >= config.steps:
+        return config
+    explorer = dataclasses.replace(config.explorer, data_capacity=config.steps + 1)
+    return dataclasses.replace(config, explorer=explorer)
+
+
+def _check_warm_up(config: RunConfig, steps: int, given: Collection[str]) -> None:
+    if config.warm_up == "none" and "warm_up_steps" in given and steps > 0:
+        raise FieldError("warm_up_steps", steps, "0, or another --warm-up", "has nobody to act, with warm_up='none'")
 
 
 def _start(argv: Sequence[str]) -> RunSpec:

@@ -13,6 +13,7 @@ from jaxplore.validate import Checks, FieldError
 
 Preset = Literal["laptop", "paper", "smoke"]
 PRESETS: tuple[str, ...] = get_args(Preset)
+WarmUp = Literal["uniform", "policy", "none"]
 
 MOST_SEEDS = 2**32
 """How many seeds there are."""
@@ -37,13 +38,20 @@ class RunConfig:
     num_seeds: int = 1
     """How many seeds, counting up from the first: side by side in one program, or each in a process (`--processes`)."""
     steps: int = 10_000
-    """Environment steps of each seed, the random ones at the start included."""
+    """Environment steps of each seed, the random ones at the start included. Those of a `--parent` come before: by
+    default they are taken off, so that both together are as many, where that leaves any."""
+    warm_up: WarmUp = "uniform"
+    """Who acts in the first `warm_up_steps`, in which nothing is learned: `uniform` actions, the `policy` of the
+    parent, drawn as it explores, or `none`, which learns from the first round on and has no such steps."""
     backend: str = "auto"
     """Physics: `mjx` (on the device), `mujoco` (C, on the host), or `auto` (`mujoco` on a CPU, else `mjx`)."""
     obs_noise: float = 0.0
     """Standard deviation of Gaussian noise on each observation, raw units."""
     checkpoint_every: int = 1_000
-    """Steps between two checkpoints."""
+    """Steps between two checkpoints, of which the two latest are kept."""
+    keep_at: tuple[int, ...] = ()
+    """Steps whose checkpoints are kept for good, such as `2000,4000`, for other runs to start from: each the end of a
+    round."""
     eval_every: int = 0
     """Steps between two evaluations: whole episodes without exploring, whose return is logged as `eval/return`. They
     change nothing else. 0: none. Only where there is a task."""
@@ -71,9 +79,22 @@ class RunConfig:
         checks.at_least("eval_every", 0)
         checks.at_least("eval_episodes", 1)
         checks.in_range("obs_noise", 0.0)
+        self._check_warm_up(checks)
+        for step in self.keep_at:
+            length, ends = self.explorer.steps_per_round, (self.explorer.warm_up_steps, self.steps)
+            if type(step) is not int or not 0 < step <= self.steps or (step % length and step not in ends):
+                allowed = f"ends of rounds up to {ends[1]}: multiples of steps_per_round={length}, {ends[0]}, {ends[1]}"
+                raise FieldError("keep_at", step, allowed, "cannot be kept", "RunConfig")
         if self.steps < self.explorer.warm_up_steps:
             allowed = f"at least warm_up_steps={self.explorer.warm_up_steps}"
             raise checks.refusal("steps", "ends within the random steps at the start", allowed)
+
+    def _check_warm_up(self, checks: Checks) -> None:
+        checks.one_of("warm_up", get_args(WarmUp))
+        if self.warm_up == "none":
+            object.__setattr__(self, "explorer", dataclasses.replace(self.explorer, warm_up_steps=0))
+        elif self.explorer.warm_up_steps == 0:
+            raise checks.refusal("warm_up", "has no steps, as warm_up_steps=0", "none, or warm_up_steps of 1 or more")
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -126,6 +147,19 @@ def _typed(path: str, value: Any, current: Any) -> Any:
 def flag(path: str) -> str:
     """The flag of a field: `explorer.sac.batch_size` is `--sac.batch-size`."""
     return "--" + path.removeprefix("explorer.").replace("_", "-")
+
+
+def check_room(config: RunConfig) -> None:
+    """Refuse a run whose replay does not hold all its steps.
+
+    Raises:
+        ValueError: names the capacity and what fits.
+    """
+    if config.explorer.data_capacity < config.steps:
+        raise ValueError(
+            f"--data-capacity={config.explorer.data_capacity} is less than the run's {config.steps} steps, so that the "
+            f"oldest data would be lost. Allowed: {config.steps} or more."
+        )
 
 
 def path_of(config: RunConfig, error: FieldError) -> str | None:

@@ -6,7 +6,7 @@
 | `versions.json` | versions of everything that results depend on, when the run began |
 | `scene.json` | what coverage counts, the floor plan, units: what reports need of the environment |
 | `metrics.jsonl` | a row per round and seed; compressed, `metrics.jsonl.gz`, in a run that was kept |
-| `checkpoints/` | the latest states, whole |
+| `checkpoints/` | the latest states, whole, and those of `keep_at` |
 | `tensorboard/`, `wandb/` | the rows as TensorBoard events, and in Weights & Biases |
 | `walk.npz` | where each step began |
 | `outcome.json` | how the run ended; the last file to be written |
@@ -18,7 +18,7 @@ import gzip
 import json
 import os
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -185,9 +185,9 @@ class RunDirectory:
                     raise self._unreadable(name, error, again) from error
         return None
 
-    def checkpoints(self) -> Checkpoints:
-        """Its checkpoints."""
-        return Checkpoints(self.path / CHECKPOINTS)
+    def checkpoints(self, keep_at: Collection[int] = ()) -> Checkpoints:
+        """Its checkpoints; when one is saved, those of the steps `keep_at` stay."""
+        return Checkpoints(self.path / CHECKPOINTS, keep_at=keep_at)
 
     # Writing.
 

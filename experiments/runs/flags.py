@@ -126,7 +126,7 @@ def _values(config: Any, parsed: Any, layout: Layout, prefix: str = "--") -> dic
         elif hints[item.name] in NUMBERS:
             found[item.name] = _number(name, text, hints[item.name])
         elif hints[item.name] == tuple[int, ...]:
-            found[item.name] = tuple(_number(name, one, int) for one in text)
+            found[item.name] = tuple(_number(name, one, int) for word in text for one in word.split(","))
         else:
             found[item.name] = text
     return found
@@ -225,7 +225,7 @@ def _mirror(config: Any, layout: Layout, *, top: bool = False) -> type:
             # As text, too: `parse` refuses it in one line, where tyro draws a box.
             settings["metavar"], hint, value = NUMBERS[hint][0], str, str(value)
         elif hint == tuple[int, ...]:
-            settings["metavar"], hint, value = "INT [INT ...]", tuple[str, ...], tuple(map(str, value))
+            settings["metavar"], hint, value = "INT,INT,...", tuple[str, ...], tuple(map(str, value))
         elif hint is bool and top:
             # Nobody asks for --no-version; a setting has both, whatever its default.
             hint = tyro.conf.FlagCreatePairsOff[bool]

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from experiments.runs import lock
-from experiments.runs.config import differences
+from experiments.runs.config import RunConfig, check_room, differences
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
 from experiments.runs.schedule import on_schedule
@@ -55,6 +55,11 @@ def choose(out: str | None, spec: RunSpec, *, resume: bool) -> RunDirectory:
     return directory
 
 
+def is_there(out: str | None) -> bool:
+    """Whether a run, or several seeds' runs, lie in a directory: what is resumed there goes on as it was begun."""
+    return out is not None and (SeedRuns(out).exists() or RunDirectory(out).status() is not Status.ABSENT)
+
+
 def _unused(spec: RunSpec) -> RunDirectory:
     config = spec.config
     env = re.sub(r"[^\w.-]", "-", config.env)
@@ -68,8 +73,11 @@ def _unused(spec: RunSpec) -> RunDirectory:
 def _check_more(all_seeds: SeedRuns, spec: RunSpec) -> None:
     """Seeds that have a run each may become more, and their runs longer; each run is checked by its own process."""
     was, config = all_seeds.spec(), spec.config
-    more = {"steps": max(was.config.steps, config.steps), "num_seeds": max(was.config.num_seeds, config.num_seeds)}
-    changed = differences(was.config, config) if dataclasses.replace(was.config, **more) != config else []
+    num_seeds = max(was.config.num_seeds, config.num_seeds)
+    allowed = dataclasses.replace(longer_config(was.config, config), num_seeds=num_seeds)
+    changed = differences(was.config, config) if allowed != config else []
+    if not changed and config.steps > was.config.steps:
+        _check_longer(all_seeds.path, was.config, config)
     _refuse(all_seeds.path, was, spec, changed, "more steps or seeds")
 
 
@@ -91,6 +99,8 @@ def _check_resume(directory: RunDirectory, status: Status, spec: RunSpec) -> Non
             "repeat that to the bit. Start a run with other settings in another --out."
         )
     longer = lengthens(directory, spec)
+    if longer:
+        _check_longer(directory.path, directory.config(), spec.config)
     if directory.is_kept() and (longer or status is not Status.FINISHED):
         raise RunError(
             f"--out={directory} is what was kept of a run, without checkpoints: it can be compared, not resumed."
@@ -107,10 +117,26 @@ def _check_resume(directory: RunDirectory, status: Status, spec: RunSpec) -> Non
 
 
 def lengthens(directory: RunDirectory, spec: RunSpec) -> bool:
-    """Whether a specification is that of the run in a directory, but with more steps."""
+    """Whether a specification is that of the run in a directory, but with more steps, and perhaps a larger replay."""
     saved = directory.config()
-    same = dataclasses.replace(saved, steps=spec.config.steps) == spec.config
-    return same and spec.config.steps > saved.steps
+    return longer_config(saved, spec.config) == spec.config and spec.config.steps > saved.steps
+
+
+def longer_config(saved: RunConfig, wanted: RunConfig) -> RunConfig:
+    """A saved configuration with as many steps, and as large a replay, as another one, where that has more."""
+    capacity = max(saved.explorer.data_capacity, wanted.explorer.data_capacity)
+    explorer = dataclasses.replace(saved.explorer, data_capacity=capacity)
+    return dataclasses.replace(saved, steps=max(saved.steps, wanted.steps), explorer=explorer)
+
+
+def _check_longer(path: Path, saved: RunConfig, config: RunConfig) -> None:
+    """A run that is made longer still has all its data, and room for more."""
+    if saved.explorer.data_capacity < saved.steps:
+        raise RunError(
+            f"--out={path} cannot be made longer: of its {saved.steps:,} steps it keeps only the latest "
+            f"{saved.explorer.data_capacity:,}, and a longer run keeps all. Start a longer run in another --out."
+        )
+    check_room(config)
 
 
 @contextlib.contextmanager

@@ -153,6 +153,18 @@ WITH_A_GENERATOR: dict[tuple[str, str], dict[str, Any]] = {
 }
 """Environment and preset -> what the explorer has where models are drawn from a generator, and not otherwise."""
 
+TASK_RUN = {"steps": 1_000_000, "checkpoint_every": 10_000, "eval_every": 5_000}
+"""A million steps, as the paper has them, evaluated every 5,000."""
+TASK_EXPLORER = {"warm_up_steps": 10_000, "data_capacity": 1_000_000}
+"""A replay that holds them all, 160 MB, and the warm-up of haarnoja/sac and of the paper."""
+
+WITH_A_TASK: dict[tuple[str, str], tuple[dict[str, Any], dict[str, Any]]] = {
+    ("half_cheetah_task", "laptop"): (TASK_RUN, TASK_EXPLORER),
+    ("half_cheetah_task", "paper"): (TASK_RUN, TASK_EXPLORER),
+}
+"""Environment and preset -> what the run, and its explorer, have where the task's reward is learned from, and not
+otherwise."""
+
 
 def settings(preset: str, env: str) -> dict[str, Any]:
     """The fields of `RunConfig` that a preset sets in an environment; both names must be known."""
@@ -172,4 +184,8 @@ def preset_config(preset: str, env: str = "ant_maze", method: str = "implicit") 
     explorer, row = config.explorer, METHODS[method]
     if "generator" in row.reads(explorer):
         explorer = dataclasses.replace(explorer, **WITH_A_GENERATOR.get((env, preset), {}))
-    return dataclasses.replace(config, explorer=row.settings(explorer))
+    run: dict[str, Any] = {}
+    if row.needs_reward and (env, preset) in WITH_A_TASK:
+        run, own = WITH_A_TASK[env, preset]
+        explorer = dataclasses.replace(explorer, **own)
+    return dataclasses.replace(config, explorer=row.settings(explorer), **run)

@@ -1,6 +1,7 @@
 """What decides a run: its configuration and its parent, as `config.json` holds them."""
 
 import dataclasses
+import functools
 import hashlib
 import json
 from collections.abc import Mapping
@@ -15,12 +16,20 @@ from experiments.runs.presets import preset_config
 from jaxplore.methods import METHODS
 from jaxplore.validate import FieldError
 
-FORMAT = 4
+FORMAT = 5
 """Of what `config.json` holds. Files without a format are of the first, 0."""
 
-WITHOUT_EFFECT = ("preset", "checkpoint_every", "eval_every", "eval_episodes")
+WITHOUT_EFFECT = ("preset", "checkpoint_every", "keep_at", "eval_every", "eval_episodes")
 """Fields of a configuration that change nothing in what a run comes to: where its settings started from, and when it is
 saved and looked at."""
+
+SINCE: dict[tuple[str, ...], Any] = {
+    ("warm_up",): "uniform",
+    ("explorer", "sac", "log_std_map"): "tanh",
+    ("explorer", "task_sac", "log_std_map"): "tanh",
+}
+"""Fields that there were not always, and what runs did before: with that value they are no part of an identity, which
+so stays what it was."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +41,13 @@ class RunRef:
     """None: its latest checkpoint."""
     identity: str = ""
     """Of the run (`RunSpec.identity`), so that another one in the same place is noticed."""
+    before: int = 0
+    """Environment steps that it counts before its own first: those of its own parent, and so on."""
+
+    @property
+    def steps(self) -> int:
+        """Environment steps behind its policy, those of its own parents included; 0 as long as `step` is None."""
+        return self.before + (self.step or 0)
 
     @classmethod
     def parse(cls, text: str) -> "RunRef":
@@ -62,6 +78,10 @@ class RunSpec:
     imports: tuple[str, ...] = ()
     """Modules of a person's own that its method or environment comes from."""
 
+    def __post_init__(self) -> None:
+        if self.config.warm_up == "policy" and self.parent is None:
+            raise FieldError("warm_up", "policy", "uniform, none, or with a parent", "has no parent whose policy acts")
+
     @property
     def identity(self) -> str:
         """A hash of what decides the result, 16 hexadecimal digits.
@@ -71,6 +91,11 @@ class RunSpec:
         """
         config = to_dict(self.config)
         read = METHODS[self.config.method].reads(self.config.explorer) if self.config.method in METHODS else None
+        for path, then in SINCE.items():
+            *groups, name = path
+            group = functools.reduce(dict.__getitem__, groups, config)
+            if group[name] == then:
+                del group[name]
         config["explorer"] = {name: v for name, v in config["explorer"].items() if read is None or name in read}
         deciding = {name: value for name, value in config.items() if name not in WITHOUT_EFFECT}
         if self.parent is not None:
@@ -145,6 +170,7 @@ def _lacks(data: Mapping[str, Any], whole: Mapping[str, Any]) -> bool:
 def _parent(data: Any) -> RunRef | None:
     if data is None:
         return None
-    if not isinstance(data, Mapping) or not {"directory"} <= data.keys() <= {"directory", "step", "identity"}:
-        raise FieldError("parent", data, "null, or an object with directory, step and identity")
+    known = {item.name for item in dataclasses.fields(RunRef)}
+    if not isinstance(data, Mapping) or not {"directory"} <= data.keys() <= known:
+        raise FieldError("parent", data, "null, or an object with directory, step, identity and before")
     return RunRef(**data)

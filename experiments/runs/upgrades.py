@@ -5,6 +5,7 @@ networks alone), and `imagination` also configured methods that imagine nothing.
 Format 1, of that month: a belief had one generator, and its features were ReLU's.
 Format 2, of that month: what a policy had imagined stayed as long as the policy lived.
 Format 3, of that month: a generator's networks met on one batch, all data counted alike, and nothing was added to them.
+Format 4, of that month: of SAC's policies all had one map to the log standard deviation.
 """
 
 import copy
@@ -31,6 +32,12 @@ UNTIL_FORMAT_4: dict[str, dict[str, Any]] = {
     "ensemble": {"bootstrap_std": 1.0},
 }
 """Group of the explorer -> settings that it did not have before format 4, as they then were."""
+
+UNTIL_FORMAT_5: dict[str, dict[str, Any]] = {"sac": {"log_std_map": "tanh"}, "task_sac": {"log_std_map": "tanh"}}
+"""The same of format 5."""
+
+OLD_SAC = {"hidden", "activation", "init", "lr", "batch_size", "alpha", "discount", "tau", "reward_scale"}
+"""Fields of SAC that a whole one had at all times."""
 
 OLD_IMAGINATION = {"num_actors", "horizon", "num_rollouts", "replay_capacity", "restart_every", "act_greedily"}
 """Fields of imagination that a whole one had before format 3."""
@@ -60,6 +67,9 @@ def upgrade(data: Mapping[str, Any], start: RunConfig, found: int) -> dict[str, 
         for group, then in UNTIL_FORMAT_4.items():
             fields = {field.name for field in dataclasses.fields(getattr(start.explorer, group))}
             _as_they_were(explorer, group, fields - then.keys(), then)
+    if found < 5:
+        for group, then in UNTIL_FORMAT_5.items():
+            _as_they_were(explorer, group, OLD_SAC, then)
     if found > 0:
         return data
     imagination = explorer.get("imagination", {})

@@ -19,7 +19,7 @@ from experiments.analysis.load import scene_of
 from experiments.analysis.tables import duration
 from experiments.runs import lock
 from experiments.runs.command import PROGRAM, CommandLine
-from experiments.runs.config import RunConfig
+from experiments.runs.config import RunConfig, check_room
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
 from experiments.runs.metrics import Row, last_row
@@ -119,6 +119,7 @@ def plan(command: CommandLine, spec: RunSpec, env: Environment, agent: Explorer)
     memory.check_steps(first)
     programs = make_programs(first, env, agent)
     if not command.resume:
+        check_room(first)
         memory.check_arrays(first, env, programs)
     there = SeedRuns(command.out) if command.resume and command.out is not None else None
     seeds = range(config.seed, config.seed + config.num_seeds)
@@ -127,12 +128,14 @@ def plan(command: CommandLine, spec: RunSpec, env: Environment, agent: Explorer)
     if spec.parent is not None and SeedRuns(spec.parent.directory).exists():
         refs = _parents(spec.parent, config)
         try:
-            parents |= {seed: parent.resolve(refs[seed], env, agent) for seed in new}
+            parents |= {seed: parent.resolve(refs[seed], env, agent, first) for seed in new}
         except FieldError as error:
             raise ValueError(error.spell("--parent")) from error
         if there is None:
             identity = SeedRuns(spec.parent.directory).spec().identity
-            spec = dataclasses.replace(spec, parent=dataclasses.replace(spec.parent, identity=identity))
+            own = parents[config.seed] or spec.parent
+            ref = dataclasses.replace(spec.parent, identity=identity, before=own.before)
+            spec = dataclasses.replace(spec, parent=ref)
     runs = [RunSpec(dataclasses.replace(first, seed=seed), parents[seed], spec.imports) for seed in new]
     return Plan(spec, runs, min(command.processes or _at_a_time(programs), config.num_seeds))
 

@@ -107,7 +107,7 @@ class Session:
         self.programs: Programs = programs
         evaluates = spec.config.eval_every > 0
         self.evaluate = make_evaluate(spec.config, env, agent, self.programs) if evaluates else None
-        self.checkpoints, self.log = directory.checkpoints(), directory.metrics_log()
+        self.checkpoints, self.log = directory.checkpoints(spec.config.keep_at), directory.metrics_log()
         self._announced: set[str] = set()
         self._lost = np.zeros(spec.config.num_seeds, int)
 
@@ -148,8 +148,10 @@ class Session:
     def _check_identity(self, meta: dict[str, Any]) -> None:
         """A checkpoint is of the run that its directory says."""
         saved = meta.get("identity")
-        # It may be of before the run was made longer.
-        then = dataclasses.replace(self.config, steps=meta.get("steps", self.config.steps))
+        # It may be of before the run was made longer, and its replay with it.
+        capacity = meta.get("data_capacity", self.config.explorer.data_capacity)
+        explorer = dataclasses.replace(self.config.explorer, data_capacity=capacity)
+        then = dataclasses.replace(self.config, steps=meta.get("steps", self.config.steps), explorer=explorer)
         if saved is not None and saved != dataclasses.replace(self.spec, config=then).identity:
             raise RunError(
                 f"the checkpoints in {self.directory} are of another run: their identity is {saved}, and the "
@@ -194,7 +196,7 @@ class Session:
         if programs.stepper.compiles:
             self._announce("environment")
         episode_step = programs.stepper.episode_step(self.state.env)
-        actors = programs.actors(self.state.explorer, warming_up)
+        actors = programs.actors(self.state.explorer, warming_up and config.warm_up == "uniform")
         env_state, transitions, valid = programs.collect(first, self.state.env, actors, end - first)
         if end < config.explorer.warm_up_steps:
             metrics, finite = {}, {}
@@ -231,7 +233,7 @@ class Session:
                     f"Seed {row['seed']} stops at step {end:,}: numbers that are not finite ({row['diverged']}). "
                     "The others continue."
                 )
-        if due(config.checkpoint_every, first, end, config.steps):
+        if due(config.checkpoint_every, first, end, config.steps) or end in config.keep_at:
             self._save(end)
         self.step = end
 

@@ -6,7 +6,9 @@ import jax
 import jax.numpy as jnp
 
 from envs.base import Environment
+from experiments.runs.config import RunConfig, flag
 from experiments.runs.directory import RunDirectory
+from experiments.runs.inherit import conflicts
 from experiments.runs.spec import RunRef
 from experiments.runs.status import Status
 from experiments.training import build
@@ -17,42 +19,75 @@ from jaxplore.types import Array
 from jaxplore.validate import FieldError
 
 
-def resolve(ref: RunRef, env: Environment, agent: Explorer) -> RunRef:
+def resolve(ref: RunRef, env: Environment, agent: Explorer, config: RunConfig) -> RunRef:
     """A reference with its step and identity filled in, checked against the run that is to start from it.
+
+    A run that is not finished has come to the checkpoints that it has, so one of them that is named is as good as
+    later; which one is its latest, changes.
 
     Args:
         ref: the parent, as it was written.
         env: where the new run takes place.
         agent: of the new run.
+        config: of the new run.
 
     Raises:
-        FieldError: it is no run, has no such checkpoint or is of other sizes, or the new agent has no policy to start
-            with.
+        FieldError: it is no run, has no such checkpoint, is not finished (unless a checkpoint is named), has diverged,
+            or is of other sizes or another form; or the new agent has no policy to start with.
         RunError: its files cannot be read.
     """
     directory = RunDirectory(ref.directory)
     if agent.adopt is None:
         allowed = "a method whose policy lives as long as the run and can be taken over, such as sac or sac_v2"
         raise FieldError("parent", str(ref), allowed, "cannot be used: this method has no policy to start with")
-    if directory.status() is Status.ABSENT:
+    status = directory.status()
+    if status is Status.ABSENT:
         raise FieldError("parent", str(ref), "the directory of a run", "holds no run")
+    if status is Status.DIVERGED:
+        raise FieldError("parent", str(ref), "a run that is finished", "diverged: its numbers are not finite")
     steps = directory.checkpoints().steps()
     if not steps or (ref.step is not None and ref.step not in steps):
         known = ", ".join(map(str, steps)) if steps else "none; it is kept, or has not come to one yet"
         what = "has no checkpoint" if ref.step is None else f"has no checkpoint of step {ref.step}"
         raise FieldError("parent", str(ref), f"one of its checkpoints ({known})", what)
+    if status is Status.PARTIAL and ref.step is None:
+        allowed = f"a run that is finished (--resume does), or one of its checkpoints, such as {ref}@{steps[-1]}"
+        raise FieldError("parent", str(ref), allowed, "is not finished")
     spec, step = directory.spec(), ref.step or steps[-1]
     parent_env = build.make_env(dataclasses.replace(spec.config, eval_every=0))
     own, other = ((one.spec.obs_size, one.spec.action_size) for one in (env, parent_env))
     if own != other:
         allowed = f"a run with {own[0]} observation entries and {own[1]} action entries"
         raise FieldError("parent", str(ref), allowed, f"has {other[0]} and {other[1]}")
+    _check_form(ref, config, spec.config)
     parent_agent = build.make_agent(spec.config, parent_env)
     here, there = (jax.tree.map(_shape, _abstract_actor(one).behaviour) for one in (agent, parent_agent))
     if here != there:
-        allowed = "a run whose method has a policy, with networks of the same widths as this one's"
+        allowed = "a run whose method has a policy of SAC's, such as implicit, max, icm or sac"
         raise FieldError("parent", str(ref), allowed, f"has another kind of policy (method {spec.config.method!r})")
-    return RunRef(ref.directory, step, spec.identity)
+    _check_alive(ref, directory, step, config)
+    return RunRef(ref.directory, step, spec.identity, spec.parent.steps if spec.parent else 0)
+
+
+def _check_form(ref: RunRef, own: RunConfig, parent: RunConfig) -> None:
+    """Parameters of the same shapes mean something else in a network of another form."""
+    found = conflicts(own, parent)
+    if found:
+        told = ", ".join(f"{path}={there!r}, not {here!r}" for path, (there, here) in found.items())
+        flags = ", ".join(flag(path) for path in found)
+        allowed = f"a run whose policy has the form of this one's, or to leave out {flags}, which the parent decides on"
+        raise FieldError("parent", str(ref), allowed, f"has a policy of another form ({told})")
+
+
+def _check_alive(ref: RunRef, directory: RunDirectory, step: int, config: RunConfig) -> None:
+    """The seeds that are taken over from had not diverged by then."""
+    parent = directory.config()
+    taken = {parent.seed + i % parent.num_seeds for i in range(config.num_seeds)}
+    rows = directory.rows() if directory.metrics_path.exists() else []
+    broken = sorted({row["seed"] for row in rows if row.get("diverged") and row["step"] <= step} & taken)
+    if broken:
+        allowed = "a run whose seeds are finite at that step"
+        raise FieldError("parent", str(ref), allowed, f"diverged in seed {', '.join(map(str, broken))}")
 
 
 def _abstract_actor(agent: Explorer) -> Actor:

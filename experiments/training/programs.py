@@ -26,7 +26,10 @@ from jaxplore.types import Array, Key, Metrics, Transition
 INIT, RESET, COLLECT, LEARN, EVALUATE = range(5)
 """What a key is for; folded into the seed's key before the step."""
 
-OLDER = Allowances({"alive": True, "episode_return": 0.0, "episode_length": 0}, ("positions", "episode_steps"))
+OLDER = Allowances(
+    {"alive": True, "episode_return": 0.0, "episode_length": 0, "explorer.frozen": False},
+    ("positions", "episode_steps", *(f"explorer.data.rows.{name}" for name in Transition._fields)),
+)
 """In what the `RunState` of an older checkpoint, or of a shorter run, differs."""
 
 

@@ -105,6 +105,7 @@ def meta(spec: RunSpec, step: int, wall_time: float) -> dict[str, Any]:
         "wall_time": wall_time,
         "identity": spec.identity,
         "steps": config.steps,
+        "data_capacity": config.explorer.data_capacity,
         "holds": f"{config.method} on {config.env} after {step} steps, {seeds}",
         "parts": [field.name for field in dataclasses.fields(RunState)],
     }

@@ -19,6 +19,7 @@ from jaxplore.learners.base import Learner, checked
 from jaxplore.networks import (
     ACTIVATIONS,
     INITIALIZERS,
+    LOG_STD_MAPS,
     MLP,
     TanhGaussianPolicy,
     apply,
@@ -60,6 +61,9 @@ class SACConfig:
     """Step of the slow value network towards the value network at each update. Paper: 5e-3."""
     reward_scale: float = 1.0
     """Factor on the reward. Paper: 1."""
+    log_std_map: str = "tanh"
+    """From the head of the policy's network to its log standard deviation: `tanh`, which is in the middle of the bounds
+    where the head is 0, as at the start (nnaisense/max), or `clip`, which is then 0 (haarnoja/sac)."""
     log_std_min: float = -20.0
     """Lower end of the policy's log standard deviation. nnaisense/max: -20."""
     log_std_max: float = 2.0
@@ -74,6 +78,7 @@ class SACConfig:
         checks.widths("hidden")
         checks.one_of("activation", ACTIVATIONS)
         checks.one_of("init", INITIALIZERS)
+        checks.one_of("log_std_map", LOG_STD_MAPS)
         for field in ("lr", "reward_scale", "grad_clip"):
             checks.in_range(field, 0.0, open_low=True)
         checks.at_least("batch_size", 1)
@@ -115,7 +120,8 @@ class SACNetworks(NamedTuple):
 def make_networks(obs_size: int, action_size: int, config: SACConfig) -> SACNetworks:
     """The networks and the optimiser that `config` describes."""
     log_std_bounds = (config.log_std_min, config.log_std_max)
-    policy = TanhGaussianPolicy(config.hidden, action_size, config.activation, config.init, log_std_bounds)
+    form = (config.activation, config.init, log_std_bounds, config.log_std_map)
+    policy = TanhGaussianPolicy(config.hidden, action_size, *form)
     value = MLP(config.hidden, 1, config.activation, config.init, config.init, config.layer_norm)
     optimizer = optax.chain(optax.clip(config.grad_clip), optax.adam(config.lr))
     return SACNetworks(policy, value, optimizer, config, obs_size, action_size)

@@ -15,7 +15,7 @@ from experiments.runs import schedule
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
 from experiments.runs.presets import preset_config
-from experiments.runs.spec import RunSpec, to_json
+from experiments.runs.spec import RunRef, RunSpec, to_json
 from tests.experiments.tiny import ROOT
 
 
@@ -51,7 +51,7 @@ def test_table_and_files(runs: list[Path], tmp_path: Path, capsys: pytest.Captur
     record = json.loads((tmp_path / "out" / "comparison.json").read_text())
     assert record["methods"]["implicit"][1]["reached"] == [25, 50, 75, 100, 125, 150, 700]
     random = {"seed": 0, "cells": 3, "reached": [25, 50, 625], "minutes": 1.0, "measures": {}}
-    random |= {"calibration": None, "last_return": None}
+    random |= {"calibration": None, "last_return": None, "final_return": None}
     assert record["methods"]["random"][0] == random
     assert (tmp_path / "out" / "coverage.png").stat().st_size > 10_000
 
@@ -233,3 +233,51 @@ def test_columns_have_nothing_where_a_row_has_none(runs: list[Path]):
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     variance = columns(runs[:1])["variance"]
     assert variance[0] == 0.5 and np.isnan(variance[1:]).all()
+
+
+def write_evaluated(path: Path, seed: int, returns: dict[int, float], steps: int, parent: RunRef | None = None) -> Path:
+    """A finished run whose own steps have evaluations."""
+    run = write_run(path, "implicit", seed, [25], steps)
+    spec = RunSpec(RunDirectory(run).config(), parent)
+    (run / "config.json").write_text(to_json(spec))
+    told = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
+    for row in told:
+        if row["step"] in returns:
+            row["eval/return"] = returns[row["step"]]
+    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in told))
+    return run
+
+
+def test_returns_count_the_steps_of_parents(tmp_path: Path, capsys: pytest.CaptureFixture):
+    # 1,000 steps: of their own, or 600 after a parent's 300 and its parent's 100
+    plain = [write_evaluated(tmp_path / f"p{i}", i, {500: 1.0 * i, 1_000: 10.0 + 4 * i}, 1_000) for i in range(2)]
+    ref = RunRef("runs/explored", 300, "0123", before=100)
+    moved = [write_evaluated(tmp_path / f"m{i}", i, {100: 2.0, 600: 20.0 + i}, 600, ref) for i in range(2)]
+    words = [*(f"plain={run}" for run in plain), *(f"moved={run}" for run in moved)]
+    assert compare.main([*words, f"--out={tmp_path / 'out'}"]) == 0
+    text = capsys.readouterr().out
+    # half-width: t(1, 0.975) = 12.706 times std / sqrt(2): 12.706 * 2 and 12.706 * 0.5
+    assert "| `plain` | 2 | 12.0 +- 25.4 | 10.0, 14.0 | 1,000 |" in text
+    assert "| `moved` | 2 | 20.5 +- 6.4 | 20.0, 21.0 | 1,000 |" in text
+    assert (tmp_path / "out" / "return.png").stat().st_size > 10_000
+    _, (own, after) = statistics.group([*plain, *moved], names=["plain"] * 2 + ["moved"] * 2)
+    assert own.evaluated.tolist() == [500, 1_000] and after.evaluated.tolist() == [500, 1_000]
+    assert own.returns.tolist() == [[0.0, 10.0], [1.0, 14.0]]
+    assert after.returns.tolist() == [[2.0, 20.0], [2.0, 21.0]]
+    assert own.steps[0] >= 425, "coverage is compared where all have some"
+    assert after.outcomes[0].reached == (425,)
+    # up to a step, parents' counted too; one that lies before a run begins is refused
+    _, (own, after) = statistics.group([*plain, *moved], 500, ["plain"] * 2 + ["moved"] * 2)
+    assert own.evaluated.tolist() == after.evaluated.tolist() == [500]
+    with pytest.raises(RunError, match=r"m0 begins after 400 steps of its parents\. Compare with --until=401 or more"):
+        statistics.group([*plain, *moved], 400, ["plain"] * 2 + ["moved"] * 2)
+    assert compare.main([*map(str, plain), f"--out={tmp_path / 'out2'}"]) == 0
+    other = write_evaluated(tmp_path / "short", 5, {}, 500, ref)
+    with pytest.raises(RunError, match=r"short is of ant_maze over 900 steps \(400 of them its parents'\)"):
+        statistics.group([*plain, other])
+
+
+def test_without_evaluations_there_is_no_picture_of_returns(runs: list[Path], tmp_path: Path, capsys):
+    assert compare.main([*map(str, runs), f"--out={tmp_path / 'out'}"]) == 0
+    assert "final return" not in capsys.readouterr().out
+    assert not (tmp_path / "out" / "return.png").exists()

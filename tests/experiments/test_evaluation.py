@@ -122,7 +122,7 @@ def test_a_run_starts_from_its_parents_policy(evaluated: Path, task: None, tmp_p
     assert run.main(words) == 0
     saved = json.loads((out / "config.json").read_text())["parent"]
     identity = RunDirectory(evaluated).spec().identity
-    assert saved == {"directory": str(evaluated), "step": 75, "identity": identity}
+    assert saved == {"directory": str(evaluated), "step": 75, "identity": identity, "before": 0}
     # the state it started from: the parent's policy and statistics, critics of its own
     config = RunDirectory(out).config()
     env = build.make_env(config)
@@ -151,7 +151,7 @@ def same(a: object, b: object) -> None:
         (SAC, "{run}@x", "Allowed: DIRECTORY or DIRECTORY@STEP, the step a whole number."),
         (SAC, "{folder}/none", "holds no run. Allowed: the directory of a run."),
         (SAC, "{kept}", "has no checkpoint. Allowed: one of its checkpoints (none; it is kept,"),
-        ((*SAC, "--task-sac.hidden", "9"), "{run}", "has another kind of policy (method 'sac')"),
+        ((*SAC, "--task-sac.hidden", "9"), "{run}", "has a policy of another form (task_sac.hidden=(8,), not (9,))"),
         (("--env=task", "--method=psne", *tiny_flags("psne")), "{run}", "this method has no policy to start with"),
         (
             ("--env=acrobot", "--method=sac", "--preset=smoke"),

@@ -159,3 +159,29 @@ def test_the_older_checkpoint_is_offered_where_the_rows_reach_it(out: Path, tell
     shutil.rmtree(newest)
     assert tell(out, "--resume").status == 0
     assert [json.loads(line)["step"] for line in path.read_text().splitlines()] == list(tiny.STEPS)
+
+
+def test_a_longer_run_has_a_larger_replay_with_the_data_that_it_had(point: str, tell, tmp_path: Path):
+    # 90 are kept of 81 steps; 120 need room for more, which is what a run of 120 had from the start
+    words = [*RANDOM, "--data-capacity=90"]
+    assert tell(tmp_path / "run", *words).status == 0
+    told = tell(tmp_path / "run", "--resume", "--steps=120", "--data-capacity=100")
+    assert told.status == 2
+    assert "--data-capacity=100 is less than the run's 120 steps" in told.stderr
+    assert tell(tmp_path / "run", "--resume", "--steps=120").status == 0
+    longer = [word for word in RANDOM if not word.startswith("--steps")]
+    assert tell(tmp_path / "twin", *longer, "--steps=120", "--data-capacity=121").status == 0
+    assert RunDirectory(tmp_path / "run").config() == RunDirectory(tmp_path / "twin").config()
+    assert leaves(tmp_path / "run", 120) == leaves(tmp_path / "twin", 120)
+
+
+def test_what_has_lost_its_oldest_data_is_not_made_longer(out: Path, tell):
+    # of before this was refused
+    path = out / "config.json"
+    saved = json.loads(path.read_text())
+    saved["explorer"]["data_capacity"] = 50
+    del saved["identity"]
+    path.write_text(json.dumps(saved))
+    told = tell(out, "--resume", "--steps=120")
+    assert told.status == 2
+    assert "cannot be made longer: of its 81 steps it keeps only the latest 50" in told.stderr

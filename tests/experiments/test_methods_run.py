@@ -13,7 +13,7 @@ from experiments.runs.rows import FIELDS, REWARD
 from jaxplore.methods import METHODS
 from tests.experiments.tiny import make_point, tiny_flags
 
-NO_REWARD = ("ddqn", "psne", "psne_no_norm", "sac", "sac_v2", "random")
+NO_REWARD = ("ddqn", "psne", "psne_no_norm", "sac", "sac_v2", "sac_explorer", "random")
 """Methods without an intrinsic reward."""
 
 

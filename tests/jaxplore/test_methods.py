@@ -176,7 +176,7 @@ def test_the_intrinsic_reward_has_a_unit(name, settings, unit):
     assert explorer.reward_unit == unit
 
 
-@pytest.mark.parametrize("name", ["ddqn", "psne", "psne_no_norm", "sac", "sac_v2", "random"])
+@pytest.mark.parametrize("name", ["ddqn", "psne", "psne_no_norm", "sac", "sac_v2", "sac_explorer", "random"])
 def test_methods_without_an_intrinsic_reward_report_none(name):
     # whatever the transitions are
     sizes = Sizes(3, 2, discrete=name == "ddqn", has_reward=True)

@@ -4,7 +4,7 @@ from experiments.analysis.figures.style import save  # First: it says what to in
 
 # isort: split
 from experiments.analysis.figures.calibration import Reliability, plot_calibration
-from experiments.analysis.figures.curves import FEW_CELLS, plot_coverage, plot_intrinsic_reward
+from experiments.analysis.figures.curves import FEW_CELLS, plot_coverage, plot_intrinsic_reward, plot_return
 from experiments.analysis.figures.floor import plot_visitation
 from experiments.analysis.figures.panels import Curves
 
@@ -15,6 +15,7 @@ __all__ = [
     "plot_calibration",
     "plot_coverage",
     "plot_intrinsic_reward",
+    "plot_return",
     "plot_visitation",
     "save",
 ]

@@ -11,6 +11,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocat
 from experiments.analysis.figures import panels as layout
 from experiments.analysis.figures.panels import Curves, draw_lines, finish, name_of, panels_of
 from experiments.analysis.figures.style import SOFT, STYLE
+from experiments.analysis.intervals import interval
 from experiments.runs.scene import Cells
 
 FEW_CELLS = 12
@@ -105,6 +106,44 @@ def plot_intrinsic_reward(
         # All panels have the same axis.
         _scale(panels[0].axes, drawn)
         finish(path, figure, panels, quantity=unit, title=title)
+
+
+def plot_return(path: str | os.PathLike[str], curves: Sequence[Curves], *, title: str | None = None) -> None:
+    """Draws returns against environment steps: a thin line per seed, their mean in bold, and around it its 95 %
+    interval (Student's t), where there are several seeds.
+
+    Args:
+        path: of the PNG to write.
+        curves: returns of evaluations, a group of lines for each method.
+        title: above the picture.
+
+    Raises:
+        ValueError: `curves` is empty, or its shapes do not match.
+        RunError: the file cannot be written.
+    """
+    _check(curves)
+    with matplotlib.rc_context(STYLE):
+        figure, panels = panels_of(curves)
+        draw_lines(
+            panels,
+            lambda group: np.mean(group.values, axis=0),
+            lambda group: name_of(group, curves, "mean"),
+        )
+        for axes, own, _ in panels:
+            bold = [line for line in axes.get_lines() if not str(line.get_label()).startswith("_")]
+            for line, group in zip(bold, own, strict=True):
+                low, high = _t_bounds(group.values)
+                axes.fill_between(group.steps, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
+            axes.grid(axis="y", color="#e4e4e4", linewidth=0.7)
+            axes.set_axisbelow(True)
+        finish(path, figure, panels, quantity="return", title=title, middle="mean")
+
+
+def _t_bounds(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ends of the 95 % interval around the mean over seeds, `[S, T] -> [T], [T]`; of one seed the mean itself."""
+    found = [interval(column) for column in values.T]
+    mean, error = (np.array([one[i] or 0.0 for one in found]) for i in range(2))
+    return mean - error, mean + error
 
 
 def _count_episodes(axes: Axes, length: int) -> None:

@@ -92,18 +92,26 @@ def draw_lines(
             axes.plot(group.steps, middle(group), dashes, color=colour, linewidth=2.4, label=name(group), **style)
 
 
-def name_of(group: Curves, curves: Sequence[Curves]) -> str:
-    """What a group is called in the legend; short where there are many, as its title, or the panel's, says the rest."""
+def name_of(group: Curves, curves: Sequence[Curves], middle: str = "median") -> str:
+    """What a group is called in the legend; short where there are many, as its title, or the panel's, says the rest.
+    `middle` is what its bold line is.
+    """
     count = len(group.values)
     if len(curves) > MOST_IN_PICTURE:
-        return "median"
+        return middle
     if len(curves) > MOST_BELOW:
         return f"{group.label}, {count}"
-    return f"{group.label}, {'median of ' if count > 1 else ''}n = {count}"
+    return f"{group.label}, {f'{middle} of ' if count > 1 else ''}n = {count}"
 
 
 def finish(
-    path: str | os.PathLike[str], figure: Figure, panels: Sequence[Panel], *, quantity: str, title: str | None
+    path: str | os.PathLike[str],
+    figure: Figure,
+    panels: Sequence[Panel],
+    *,
+    quantity: str,
+    title: str | None,
+    middle: str = "median",
 ) -> None:
     """Names steps and quantity, adds the legend outside of all axes, and writes the file.
 
@@ -113,6 +121,7 @@ def finish(
         panels: its panels, drawn.
         quantity: label of the upright axis.
         title: above the picture.
+        middle: what the bold lines are.
 
     Raises:
         RunError: the file cannot be written.
@@ -133,22 +142,22 @@ def finish(
         figure.supylabel(quantity, fontsize=10)
         if title:
             figure.suptitle(title, x=0.01, ha="left")
-    _add_legend(figure, first, curves)
+    _add_legend(figure, first, curves, middle)
     save(figure, path)
 
 
-def _add_legend(figure: Figure, axes: Axes, curves: Sequence[Curves]) -> None:
+def _add_legend(figure: Figure, axes: Axes, curves: Sequence[Curves], middle: str) -> None:
     handles, labels = axes.get_legend_handles_labels()
     if len(curves) > MOST_IN_PICTURE:
         # The first panel has the names of all.
         handles += [
             Line2D([], [], color=COLOURS[0], linewidth=0.8, alpha=0.45, label="each seed"),
-            Line2D([], [], color=OTHERS, linewidth=0.8, label="medians of the others"),
+            Line2D([], [], color=OTHERS, linewidth=0.8, label=f"{middle}s of the others"),
         ]
         figure.legend(handles=handles, loc="outside lower right", frameon=False, ncols=len(handles))
     elif len(curves) > MOST_BELOW:
         figure.set_figwidth(figure.get_figwidth() * 1.3)
-        title = "median, of so many seeds"
+        title = f"{middle}, of so many seeds"
         figure.legend(handles, labels, loc="outside right upper", frameon=False, title=title, alignment="left")
     elif handles:
         columns = 2 if max(map(len, labels)) <= 34 and len(labels) > 1 else 1

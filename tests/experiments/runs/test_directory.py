@@ -22,7 +22,7 @@ from experiments.runs.presets import preset_config
 from experiments.runs.scene import Cells, Scene
 from experiments.runs.spec import RunRef, RunSpec
 from experiments.runs.status import Status
-from experiments.runs.upgrades import UNTIL_FORMAT_4
+from experiments.runs.upgrades import UNTIL_FORMAT_4, UNTIL_FORMAT_5
 from experiments.training import build
 from jaxplore.config import ExplorationConfig
 from tests.experiments.tiny import ROOT
@@ -148,8 +148,8 @@ def test_a_changed_configuration_is_noticed_in_a_run_and_welcome_in_a_file(tmp_p
 def test_a_newer_format_is_refused(tmp_path: Path):
     directory = begun(tmp_path)
     path = tmp_path / "config.json"
-    path.write_text(path.read_text().replace('"format": 4', '"format": 5'))
-    with pytest.raises(RunError, match=r"has format 5; this version reads formats 0 to 4.*versions\.json"):
+    path.write_text(path.read_text().replace('"format": 5', '"format": 6'))
+    with pytest.raises(RunError, match=r"has format 6; this version reads formats 0 to 5.*versions\.json"):
         directory.status() and directory.config()
 
 
@@ -179,7 +179,7 @@ def test_every_kept_run_reads(path: Path):
         old[name] for name in ("env", "method", "seed", "steps")
     )
     if "format" in old:
-        was = {group: {**then, **old["explorer"][group]} for group, then in UNTIL_FORMAT_4.items()}
+        was = {group: {**then, **old["explorer"][group]} for group, then in (UNTIL_FORMAT_4 | UNTIL_FORMAT_5).items()}
         assert json.loads(json.dumps(dataclasses.asdict(config.explorer))) == {**old["explorer"], **was}
     else:
         check_first_format(config.explorer, old["explorer"])

@@ -75,10 +75,30 @@ PAPER = {
     "explorer.sac.discount": 0.99,
     "explorer.sac.tau": 5e-3,
     "explorer.sac.reward_scale": 1.0,
+    "explorer.sac.log_std_map": "tanh",
     "explorer.sac.log_std_min": -20.0,
     "explorer.sac.log_std_max": 2.0,
     "explorer.sac.policy_penalty": 1e-3,
     "explorer.sac.grad_clip": 5.0,
+    # haarnoja/sac on the half cheetah: baselines.md, section 7.
+    "explorer.task_sac.hidden": (256, 256),
+    "explorer.task_sac.activation": "relu",
+    "explorer.task_sac.init": "xavier",
+    "explorer.task_sac.layer_norm": False,
+    "explorer.task_sac.lr": 3e-4,
+    "explorer.task_sac.batch_size": 256,
+    "explorer.task_sac.alpha": 1.0,
+    "explorer.task_sac.learn_alpha": False,
+    "explorer.task_sac.discount": 0.99,
+    "explorer.task_sac.tau": 5e-3,
+    "explorer.task_sac.reward_scale": 5.0,
+    "explorer.task_sac.log_std_map": "clip",
+    "explorer.task_sac.log_std_min": -20.0,
+    "explorer.task_sac.log_std_max": 2.0,
+    "explorer.task_sac.policy_penalty": 0.0,
+    "explorer.task_sac.grad_clip": 1e6,
+    "explorer.model_free.updates_per_round": 25,
+    "explorer.model_free.act_greedily": False,
 }
 
 
@@ -232,7 +252,7 @@ def test_a_saved_configuration_names_every_field():
 
     saved = json.loads(to_json(RunConfig()))
     assert (
-        {saved.pop("format"), saved.pop("parent")} == {4, None}
+        {saved.pop("format"), saved.pop("parent")} == {5, None}
         and saved.pop("imports") == []
         and len(saved.pop("identity")) == 16
     )
@@ -270,3 +290,64 @@ def test_a_generator_of_before_there_were_settings_for_it_is_what_it_was():
     partial = spec.from_json('{"format": 1, "explorer": {"generator": {"noise_size": 8}}}', "c.json").config
     preset = preset_config("laptop").explorer.generator
     assert partial.explorer.generator == dataclasses.replace(preset, noise_size=8)
+
+
+def test_sac_of_before_format_5_is_what_it_was_and_keeps_its_identity():
+    # whatever a preset has by now, and also where fields are missing that SAC did not always have
+    config = replace(preset_config("laptop", "acrobot", "sac"), {"explorer": {"task_sac": {"log_std_map": "tanh"}}})
+    now = RunSpec(config)
+    saved = json.loads(spec.to_json(now))
+    saved["format"] = 4
+    del saved["warm_up"], saved["keep_at"]
+    for group in ("sac", "task_sac"):
+        del saved["explorer"][group]["log_std_map"], saved["explorer"][group]["layer_norm"]
+    old = spec.from_json(json.dumps(saved), "c.json", as_written=True)
+    assert old == now and old.identity == now.identity
+    assert old.identity == "de723502dc983229", "as it was before there were these settings"
+    changed = replace(config, {"explorer": {"task_sac": {"log_std_map": "clip"}}})
+    assert RunSpec(changed).identity != now.identity
+    assert RunSpec(dataclasses.replace(config, warm_up="none")).identity != now.identity
+    assert RunSpec(dataclasses.replace(config, keep_at=(50,))).identity == now.identity
+    written = '{"format": 4, "env": "acrobot", "method": "sac", "explorer": {"task_sac": {"lr": 1e-4}}}'
+    assert spec.from_json(written, "c.json").config.explorer.task_sac.log_std_map == "clip"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"warm_up": "policies"}, r"warm_up='policies' is not known\. Did you mean 'policy'\?"),
+        ({"explorer": {"warm_up_steps": 0}}, r"warm_up='uniform' has no steps, as warm_up_steps=0\. Allowed: none, or"),
+        (
+            {"keep_at": (2_010,)},
+            r"keep_at=2010 cannot be kept\. Allowed: ends of rounds up to 10000: multiples of step",
+        ),
+        ({"keep_at": (2_000, 10_025)}, r"keep_at=10025 cannot be kept"),
+        ({"keep_at": ("2000",)}, r"keep_at='2000' cannot be kept"),
+    ],
+)
+def test_a_bad_start_or_checkpoint_is_refused(changes: dict, message: str):
+    with pytest.raises(FieldError, match=message):
+        replace(preset_config("laptop"), changes)
+
+
+def test_without_a_warm_up_there_are_no_steps_of_one():
+    config = dataclasses.replace(preset_config("laptop"), warm_up="none", keep_at=(256 + 19, 10_000))
+    assert config.explorer.warm_up_steps == 0
+    assert from_json(to_json(config), "config.json") == config
+    assert dataclasses.replace(preset_config("laptop"), keep_at=(256,)).keep_at == (256,), "the warm-up's end"
+
+
+def test_a_policy_warms_up_only_with_a_parent():
+    config = dataclasses.replace(preset_config("laptop", "acrobot", "sac"), warm_up="policy")
+    with pytest.raises(FieldError, match=r"warm_up='policy' has no parent whose policy acts\. Allowed: uniform, none"):
+        RunSpec(config)
+    assert RunSpec(config, spec.RunRef("runs/explored", 4_000)).config.warm_up == "policy"
+
+
+def test_the_tasks_learners_have_a_million_steps_on_the_cheetah_and_explorers_do_not():
+    for preset in ("laptop", "paper"):
+        config = preset_config(preset, "half_cheetah_task", "sac")
+        assert (config.steps, config.explorer.data_capacity, config.explorer.warm_up_steps) == (10**6, 10**6, 10**4)
+        assert (config.eval_every, config.eval_episodes) == (5_000, 5)
+        explorer = preset_config(preset, "half_cheetah_task", "implicit")
+        assert explorer == dataclasses.replace(preset_config(preset, "brax:hopper"), env="half_cheetah_task")

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy import integrate, optimize, stats
 
+from jaxplore.config import TASK_SAC
 from jaxplore.learners.sac import SACConfig, action_values, make_networks, make_sac
-from jaxplore.networks import GaussianParams, sample_tanh_gaussian
+from jaxplore.networks import GaussianParams, apply, sample_tanh_gaussian
 from jaxplore.types import Transition
 from tests.jaxplore import probes
 
@@ -185,6 +186,20 @@ def test_actions_are_the_policys():
     assert np.mean(actions < math.tanh(0.4 + math.exp(-1))) == pytest.approx(stats.norm.cdf(1), abs=0.02)
 
 
+def test_a_clipped_head_is_the_log_standard_deviation():
+    # the task's SAC starts at a standard deviation of 1, where nnaisense/max's map starts in the middle of its bounds
+    for config, want in ((TASK_SAC, 0.0), (SACConfig(), -9.0)):
+        networks = make_networks(5, 2, config)
+        params = networks.policy.init(jax.random.key(0), jnp.zeros(5))["params"]
+        obs = jax.random.normal(jax.random.key(1), (1_000, 5))
+        assert float(jnp.mean(apply(networks.policy, params, obs).log_std)) == pytest.approx(want, abs=0.25)
+    sac = make_sac(2, 1, SACConfig(hidden=(3, 3), log_std_map="clip", log_std_min=-2.0, log_std_max=1.0))
+    networks = make_networks(2, 1, SACConfig(hidden=(3, 3), log_std_map="clip", log_std_min=-2.0, log_std_max=1.0))
+    for head, want in ((-7.0, -2.0), (-0.5, -0.5), (4.0, 1.0)):
+        actor = sac.actor(constant_networks(sac, [0.0, 0.0], 0.0, 0.0, head=head))
+        assert float(apply(networks.policy, actor, jnp.zeros(2)).log_std[0]) == pytest.approx(want)
+
+
 def train(names, steps, starts=None, **settings):
     """SAC on batches from each probe, side by side in one program: `(sac, states, metrics)`, lists.
 
@@ -285,5 +300,7 @@ def test_bad_settings_are_refused():
         SACConfig(alpha=0.0, learn_alpha=True)
     with pytest.raises(ValueError, match=r"SACConfig\.target_entropy=1\.0 "):
         SACConfig(target_entropy=1.0)
+    with pytest.raises(ValueError, match=r"SACConfig\.log_std_map='clipp' .*Did you mean 'clip'"):
+        SACConfig(log_std_map="clipp")
     with pytest.raises(ValueError, match=r"SACConfig\.init='ortogonal' .*Did you mean 'orthogonal'"):
         SACConfig(init="ortogonal")

@@ -1,0 +1,267 @@
+"""Runs that start from another run's policy: what comes with it, who warms up, and what is refused."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import envs
+from experiments import run
+from experiments.runs.directory import RunDirectory
+from experiments.runs.spec import RunRef
+from experiments.runs.status import Status
+from experiments.training import build, loop, parent
+from tests.experiments.test_methods_run import make_task_point
+from tests.experiments.tiny import leaves, rows, tiny_flags
+
+EXPLORE = ("--env=task", "--method=disagreement", *tiny_flags("disagreement"), "--keep-at=25,50", "--num-seeds=2")
+# Rounds of 25, 15 and 25 steps; the network's form is the parent's.
+LEARN = ("--env=task", "--method=sac", "--preset=smoke", "--steps=65", "--warm-up-steps=40", "--checkpoint-every=20")
+LEARN = (*LEARN, "--task-sac.batch-size=8", "--model-free.updates-per-round=2")
+
+
+@pytest.fixture(autouse=True)
+def task(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(envs.FACTORIES, "task", make_task_point)
+
+
+@pytest.fixture(scope="module")
+def explored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny run that explores, two seeds, 81 steps, checkpoints of 25, 50, 75 and 81. Not to be written to."""
+    out = tmp_path_factory.mktemp("explored") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(envs.FACTORIES, "task", make_task_point)
+        assert run.main([*EXPLORE, f"--out={out}"]) == 0
+    return out
+
+
+def explorer_of(out: Path, step: int | None = None):
+    """The agent of a run, and the state of its first seed at a step."""
+    directory = RunDirectory(out)
+    env = build.make_env(directory.config())
+    agent = build.make_agent(directory.config(), env)
+    state, _ = loop.last_state(directory, env, agent, step)
+    return agent, jax.tree.map(lambda leaf: leaf[0], state.explorer)
+
+
+def same(a: object, b: object) -> None:
+    assert all(jax.tree.leaves(jax.tree.map(lambda x, y: bool(jnp.array_equal(x, y)), a, b)))
+
+
+def test_checkpoints_are_kept_at_the_steps_that_are_named(explored: Path):
+    # 25 and 50 for good; of the others the two latest
+    assert RunDirectory(explored).checkpoints().steps() == [25, 50, 75, 81]
+
+
+def test_the_form_of_the_policy_and_the_steps_that_are_left_come_from_the_parent(
+    explored: Path, tmp_path: Path, capsys
+):
+    out = tmp_path / "child"
+    words = [word for word in LEARN if not word.startswith("--steps")]
+    assert run.main([*words, "--task-sac.lr=0.01", f"--parent={explored}@50", f"--out={out}"]) == 0
+    assert f"550 steps after 50 of {explored}@50" in capsys.readouterr().out, "of the preset's 600"
+    spec = RunDirectory(out).spec()
+    own, theirs = spec.config.explorer.task_sac, RunDirectory(explored).config().explorer.sac
+    form = ("hidden", "activation", "log_std_map", "log_std_min", "log_std_max")
+    assert [getattr(own, name) for name in form] == [getattr(theirs, name) for name in form]
+    assert own.hidden == (8,) and own.activation == "leaky_relu" and own.log_std_map == "tanh"
+    assert (own.lr, own.alpha, own.reward_scale, own.init) == (0.01, 1.0, 5.0, "xavier"), "all else is the task's"
+    assert spec.config.steps == 550 and spec.parent is not None and spec.parent.steps == 50
+    assert rows(out)[-1]["step"] == 550, "its own steps"
+
+
+def test_the_parents_policy_acts_to_the_bit_until_the_first_update(explored: Path, tmp_path: Path):
+    out = tmp_path / "child"
+    words = [*LEARN, "--warm-up=policy", f"--parent={explored}", "--keep-at=25,40", "--seed=5", f"--out={out}"]
+    assert run.main(words) == 0
+    (agent, before), (theirs, parents) = explorer_of(out, 25), explorer_of(explored)
+    obs = jax.random.normal(jax.random.key(3), (64, 4))
+    for how in ("act", "act_greedily"):
+        mine, its = (
+            jax.jit(getattr(one, how))(jax.random.key(1), one.actor(state), obs)
+            for one, state in ((agent, before), (theirs, parents))
+        )
+        # what the explorer holds for the best is its mean; it is drawn where the task is learned
+        if how == "act_greedily":
+            np.testing.assert_array_equal(mine, its)
+        else:
+            assert not np.array_equal(mine, its)
+    # the warm-up's actions are drawn from it, at the observations that there were
+    rows_ = jax.tree.map(lambda leaf: leaf[:25], before.data.rows)
+    greedy = jax.jit(agent.act_greedily)(jax.random.key(1), theirs.actor(parents), rows_.obs)
+    drawn = np.asarray(rows_.action)
+    assert int(before.data.size) == 25 and not np.array_equal(drawn, greedy)
+    log_std = np.asarray(_gaussian(out, theirs.actor(parents), rows_.obs).log_std)
+    noise = (np.arctanh(drawn.astype(float)) - np.arctanh(np.asarray(greedy, float))) / np.exp(log_std)
+    assert np.abs(noise).max() < 5 and 0.5 < noise.std() < 1.5, "as the parent's own distribution has it"
+    # nothing is learned before step 40, and then something is
+    same(before.behaviour.params["policy"], parents.behaviour.learner.params["policy"])
+    same(explorer_of(out, 25)[1].behaviour.opt_state, jax.tree.map(np.zeros_like, before.behaviour.opt_state))
+    after = explorer_of(out, 40)[1].behaviour.params["policy"]["mlp"]["output"]["kernel"]
+    assert not np.array_equal(after, before.behaviour.params["policy"]["mlp"]["output"]["kernel"])
+
+
+def _gaussian(out: Path, actor, obs):
+    from jaxplore import normalizer
+    from jaxplore.learners.sac import make_networks
+    from jaxplore.networks import apply
+
+    networks = make_networks(4, 2, RunDirectory(out).config().explorer.task_sac)
+    return apply(networks.policy, actor.behaviour, normalizer.normalize(actor.normalizers.obs, obs))
+
+
+def test_uniform_actions_warm_up_where_they_are_asked_for(explored: Path, tmp_path: Path):
+    # the same as those of a run without a parent: the key says which, and the policy nothing
+    words = [*LEARN, "--keep-at=40", "--task-sac.hidden", "8"]
+    assert run.main([*words, f"--parent={explored}", f"--out={tmp_path / 'child'}"]) == 0
+    assert run.main([*words, f"--out={tmp_path / 'orphan'}"]) == 0
+    child, orphan = (explorer_of(tmp_path / name, 40)[1] for name in ("child", "orphan"))
+    same(child.data, orphan.data)
+    assert np.abs(np.asarray(child.data.rows.action[:40])).std() == pytest.approx(12**-0.5, abs=0.06)
+
+
+def test_without_a_warm_up_it_learns_from_the_first_round_on(explored: Path, tmp_path: Path):
+    out = tmp_path / "child"
+    words = [word for word in LEARN if not word.startswith("--warm-up-steps")]
+    assert run.main([*words, "--warm-up=none", f"--parent={explored}", "--keep-at=25", f"--out={out}"]) == 0
+    told = rows(out)
+    assert [row["step"] for row in told] == [25, 50, 65]
+    assert all("policy/q_loss" in row for row in told)
+    _, first = explorer_of(out, 25)
+    assert int(first.data.size) == 25, "it started empty"
+    parents = explorer_of(explored)[1].behaviour.learner.params["policy"]["mlp"]["output"]["kernel"]
+    moved = np.asarray(first.behaviour.params["policy"]["mlp"]["output"]["kernel"]) - np.asarray(parents)
+    assert 0 < np.abs(moved).max() < 3e-3, "two updates away from the parent's policy, with steps of 3e-4"
+
+
+def test_statistics_stay_as_the_parent_had_them_and_only_there(explored: Path, tmp_path: Path):
+    assert run.main([*LEARN, f"--parent={explored}", f"--out={tmp_path / 'child'}"]) == 0
+    assert run.main([*LEARN, "--task-sac.hidden", "8", f"--out={tmp_path / 'orphan'}"]) == 0
+    theirs, child, orphan = (explorer_of(out)[1] for out in (explored, tmp_path / "child", tmp_path / "orphan"))
+    same(child.normalizers, theirs.normalizers)
+    assert bool(child.frozen) and not bool(theirs.frozen) and not bool(orphan.frozen)
+    assert float(orphan.normalizers.obs.count) == 65 and float(theirs.normalizers.obs.count) == 81
+    # a grandchild has the child's, which are the first one's, and counts all steps before its own
+    out = tmp_path / "grandchild"
+    assert run.main([*LEARN, f"--parent={tmp_path / 'child'}", f"--out={out}"]) == 0
+    same(explorer_of(out)[1].normalizers, theirs.normalizers)
+    ref = RunDirectory(out).spec().parent
+    assert ref is not None and (ref.step, ref.before, ref.steps) == (65, 81, 146)
+
+
+def test_resumed_it_is_the_run_that_was_never_stopped(explored: Path, tmp_path: Path):
+    words = [*LEARN, "--warm-up=policy", f"--parent={explored}"]
+    assert run.main([*words, f"--out={tmp_path / 'whole'}"]) == 0
+    shutil.copytree(tmp_path / "whole", tmp_path / "cut")
+    shutil.rmtree(tmp_path / "cut/checkpoints/65")
+    (tmp_path / "cut/outcome.json").unlink()
+    assert run.main([f"--out={tmp_path / 'cut'}", "--resume"]) == 0
+    assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
+    assert leaves(tmp_path / "cut", 65) == leaves(tmp_path / "whole", 65)
+
+
+def test_a_named_checkpoint_of_an_unfinished_run_will_do(explored: Path, tmp_path: Path, capsys):
+    half = tmp_path / "half"
+    shutil.copytree(explored, half)
+    (half / "outcome.json").unlink()
+    assert RunDirectory(half).status() is Status.PARTIAL
+    assert run.main([*LEARN, f"--parent={half}", f"--out={tmp_path / 'child'}"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: --parent={str(half)!r} is not finished. Allowed: a run that is finished")
+    assert line.endswith(f"or one of its checkpoints, such as {half}@81.")
+    assert not (tmp_path / "child").exists()
+    assert run.main([*LEARN, f"--parent={half}@50", f"--out={tmp_path / 'child'}"]) == 0
+
+
+REFUSED = [
+    (("--task-sac.hidden", "9"), "has a policy of another form (task_sac.hidden=(8,), not (9,)). Allowed: a run whose"),
+    (("--task-sac.log-std-map=clip",), "another form (task_sac.log_std_map='tanh', not 'clip')"),
+    (("--task-sac.activation=relu",), "or to leave out --task-sac.activation, which the parent decides on"),
+    (("--model-free.no-normalize-obs",), "another form (model_free.normalize_obs=True, not False)"),
+]
+
+
+@pytest.mark.parametrize(("flags", "message"), REFUSED)
+def test_what_the_parent_decides_on_is_refused_where_it_differs(
+    flags: tuple[str, ...], message: str, explored: Path, tmp_path: Path, capsys
+):
+    assert run.main([*LEARN, *flags, f"--parent={explored}", f"--out={tmp_path / 'run'}"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: --parent={str(explored)!r} has a policy of") and message in line
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--warm-up=policy",), "--warm-up='policy' has no parent whose policy acts. Allowed: uniform, none"),
+        (("--warm-up=non",), "--warm-up='non' is not known. Did you mean 'none'?"),
+        (("--warm-up=none",), "--warm-up-steps=40 has nobody to act, with warm_up='none'. Allowed: 0, or another"),
+        (("--keep-at=25,30",), "--keep-at=30 cannot be kept. Allowed: ends of rounds up to 65: multiples of steps_per"),
+        (("--keep-at=25,x",), "--keep-at='x' is not a number"),
+        (("--data-capacity=64",), "--data-capacity=64 is less than the run's 65 steps, so that the oldest data would"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_written(words, message: str, tmp_path: Path, capsys):
+    assert run.main([*LEARN, *words, f"--out={tmp_path / 'run'}"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line, line
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("which", ["random", "psne"])
+def test_a_parent_without_such_a_policy_is_refused(which: str, tmp_path: Path, capsys):
+    other = tmp_path / "other"
+    assert run.main(["--env=task", f"--method={which}", *tiny_flags(which), f"--out={other}"]) == 0
+    capsys.readouterr()
+    assert run.main([*LEARN, f"--parent={other}", f"--out={tmp_path / 'run'}"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"has another kind of policy (method {which!r}). Allowed: a run whose method has a policy of SAC's" in line
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_parent_that_diverged_is_refused(explored: Path, tmp_path: Path, capsys):
+    broken, half = tmp_path / "broken", tmp_path / "half"
+    for out, status in ((broken, "diverged"), (half, "finished")):
+        shutil.copytree(explored, out)
+        (out / "outcome.json").write_text(json.dumps({"status": status, "diverged": {}}))
+        lines = (out / "metrics.jsonl").read_text().splitlines()
+        kept = [json.loads(line) for line in lines]
+        kept = [row for row in kept if (row["step"], row["seed"]) not in {(75, 1), (81, 1)}]
+        next(row for row in reversed(kept) if row["seed"] == 1)["diverged"] = "q_loss"
+        (out / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in kept))
+    for ref, flags, message in (
+        (broken, (), "diverged: its numbers are not finite. Allowed: a run that is finished"),
+        (f"{broken}@50", (), "diverged: its numbers"),
+        (half, ("--num-seeds=2",), "diverged in seed 1. Allowed: a run whose seeds are finite at that step"),
+    ):
+        assert run.main([*LEARN, *flags, f"--parent={ref}", f"--out={tmp_path / 'run'}"]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert re.search(re.escape(message), line), line
+        assert not (tmp_path / "run").exists()
+    # its other seed, and what came before, are whole
+    env = build.make_env(RunDirectory(half).config())
+    child = build.make_agent(_sac(explored), env)
+    assert parent.resolve(RunRef(str(half)), env, child, _sac(explored)).step == 81
+
+
+def _sac(explored: Path):
+    from experiments.run import inherited
+    from experiments.runs.command import parse
+
+    words = [*LEARN, f"--parent={explored}"]
+    return inherited(parse(words)[1], words).config
+
+
+def test_a_run_is_given_a_replay_that_holds_all_its_steps():
+    from experiments.runs.command import parse
+
+    capacity = lambda *words: parse(["--method=random", *words])[1].config.explorer.data_capacity  # noqa: E731
+    assert capacity() == capacity("--steps=9000") == 10_001
+    assert capacity("--steps=20000") == 20_001
+    assert capacity("--steps=20000", "--data-capacity=20000") == 20_000
