@@ -48,6 +48,16 @@ def _learner(config: RunConfig) -> str | None:
     return next((name for name in LEARNERS if name in read), None)
 
 
+def take_form(config: RunConfig, parent: RunConfig, given: Collection[str] = ()) -> RunConfig:
+    """A run's configuration with the form of its parent's policy, but for the paths in `given`."""
+    theirs, changes = form_of(parent), {}
+    for name, path in paths_of_form(config).items():
+        if name in theirs and path not in given:
+            group, _, field = path.partition(".")
+            changes.setdefault(group, {})[field] = theirs[name]
+    return replace(config, {"explorer": changes})
+
+
 def inherit(spec: RunSpec, given: Collection[str]) -> RunSpec:
     """A run with what its parent decides on: the form of the policy, and as many steps less as it took, where that
     leaves more than the warm-up.
@@ -66,12 +76,7 @@ def inherit(spec: RunSpec, given: Collection[str]) -> RunSpec:
     if directory.status() is Status.ABSENT:
         return spec
     parent = directory.spec()
-    theirs, changes = form_of(parent.config), {}
-    for name, path in paths_of_form(spec.config).items():
-        if name in theirs and path not in given:
-            group, _, field = path.partition(".")
-            changes.setdefault(group, {})[field] = theirs[name]
-    config = replace(spec.config, {"explorer": changes})
+    config = take_form(spec.config, parent.config, given)
     left = config.steps - (_before(parent) + (spec.parent.step or parent.config.steps))
     if "steps" not in given and left > config.explorer.warm_up_steps:
         config = dataclasses.replace(config, steps=left)

@@ -153,6 +153,12 @@ WITH_A_GENERATOR: dict[tuple[str, str], dict[str, Any]] = {
 }
 """Environment and preset -> what the explorer has where models are drawn from a generator, and not otherwise."""
 
+CHOSEN_ALPHA: dict[tuple[str, str], dict[str, float]] = {
+    ("ant_maze", "laptop"): {"disagreement": 0.02, "icm": 0.02, "max": 0.1},
+}
+"""Environment and preset -> method -> SAC's weight of entropy, where one was chosen for it by a search of the same size
+as the others', and is not the preset's."""
+
 TASK_RUN = {"steps": 1_000_000, "checkpoint_every": 10_000, "eval_every": 5_000}
 """A million steps, as the paper has them, evaluated every 5,000."""
 TASK_EXPLORER = {"warm_up_steps": 10_000, "data_capacity": 1_000_000}
@@ -184,6 +190,8 @@ def preset_config(preset: str, env: str = "ant_maze", method: str = "implicit") 
     explorer, row = config.explorer, METHODS[method]
     if "generator" in row.reads(explorer):
         explorer = dataclasses.replace(explorer, **WITH_A_GENERATOR.get((env, preset), {}))
+    alpha = CHOSEN_ALPHA.get((env, preset), {}).get(method, explorer.sac.alpha)
+    explorer = dataclasses.replace(explorer, sac=dataclasses.replace(explorer.sac, alpha=alpha))
     run: dict[str, Any] = {}
     if row.needs_reward and (env, preset) in WITH_A_TASK:
         run, own = WITH_A_TASK[env, preset]

@@ -15,7 +15,7 @@ import jax
 
 import envs
 from experiments.analysis.tables import duration, markdown_table
-from experiments.runs import lock
+from experiments.runs import inherit, lock
 from experiments.runs.config import RunConfig
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError, disk_error
@@ -160,6 +160,7 @@ def _add(
         ref = None
         if parent is not None and parent.spec is not None:
             ref = RunRef(str(parent.path), at or parent.spec.config.steps, parent.key)
+            one = inherit.take_form(one, parent.spec.config)
             jobs[parent.key] = parent._replace(is_parent=True)
         job = _job(RunSpec(one, ref), out, parent)
         known = jobs.get(job.key, job)

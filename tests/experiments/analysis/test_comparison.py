@@ -8,7 +8,8 @@ from experiments.runs.scene import Cells
 def make_group(label: str, *reached: tuple[int, ...]) -> Group:
     outcomes = [Outcome(seed, len(steps), steps, 1.0, {}, None, None) for seed, steps in enumerate(reached)]
     coverage = np.array([[len(steps) / 2] for steps in reached])
-    return Group(label, outcomes, np.array([100]), coverage, np.full_like(coverage, np.nan))
+    nothing = np.full_like(coverage, np.nan)
+    return Group(label, outcomes, np.array([100]), coverage, nothing, np.array([]), nothing[:, :0])
 
 
 def test_where_nothing_or_not_all_was_found_there_is_no_step():

@@ -138,10 +138,14 @@ def test_the_smoke_preset_is_smaller_in_everything_that_costs():
 
 
 def test_what_was_chosen_for_the_generator_is_not_static_networks():
-    """One preset, two rates: each belief has the one that was tried with it; everything else they share."""
+    """One preset, two rates and as many weights of entropy: each has what was searched for it; the rest they share."""
     proposed, static = (preset_config("laptop", "ant_maze", method).explorer for method in ("implicit", "disagreement"))
     assert (proposed.fit.lr, static.fit.lr) == (6e-3, 3e-3)
-    assert dataclasses.replace(proposed, fit=static.fit) == static
+    assert (proposed.sac.alpha, static.sac.alpha) == (0.05, 0.02)
+    assert dataclasses.replace(proposed, fit=static.fit, sac=static.sac) == static
+    assert preset_config("laptop", "ant_maze", "max").explorer.sac.alpha == 0.1
+    assert preset_config("laptop", "acrobot", "max").explorer.sac.alpha == 0.02
+    assert preset_config("laptop", "ant_maze", "max_trajectory").explorer.sac.alpha == 0.2, "its authors' own"
     for method in ("implicit_reactive", "implicit_grad"):
         assert preset_config("laptop", "ant_maze", method).explorer.fit.lr == 6e-3
     assert preset_config("laptop", "ant_maze", "random").explorer.fit.lr == 3e-3
