@@ -40,7 +40,7 @@ def ahead(first: str, second: str, part: int = 0) -> Condition:
         mean, half = found.difference
         if half is None:
             return "undecided", f"{first} less {second}: {number(mean)} on one seed"
-        why = f"{first} less {second}: {number(mean)} +- {number(half)} on {len(found.seeds)} seeds"
+        why = f"{first} less {second}: {number(mean)} ± {number(half)} on {len(found.seeds)} seeds"
         return "holds" if mean - half > 0 else "does not hold" if mean + half < 0 else "undecided", why
 
     return Condition(f"{first} ahead of {second}", part, decide)
@@ -77,7 +77,7 @@ def _beside(label: str, scores: Scores, compare: Callable[[float, float], tuple[
         return "not run", f"no runs of {label}"
     mean, half = interval(values)
     good, bad = compare(mean - (half or 0.0), mean + (half or 0.0))
-    width = "" if half is None else f" +- {number(half)}"
+    width = "" if half is None else f" ± {number(half)}"
     return "holds" if good else "does not hold" if bad else "undecided", f"{label}: {number(mean)}{width}"
 
 

@@ -154,8 +154,8 @@ def _table(part: Part, lines: Mapping[str, Line], printed: Mapping[str, str]) ->
     """A line for each label: its number and how sure it is, and against the first label, the proposed method's."""
     first = next(iter(lines))
     reference = lines[first]
-    head = ("", "seeds", "interquartile mean, 95 %", "mean +- deviation", f"`{first}` less it, by seed, 95 %")
-    head = (*head, f"probability of `{first}` ahead", *(["the paper's"] if printed else []))
+    head = ("", "seeds", "interquartile mean, 95 %", "mean ± deviation", f"{first} less it, by seed, 95 %")
+    head = (*head, f"probability of {first} ahead", *(["the paper's"] if printed else []))
     rows = []
     for label, line in lines.items():
         values = np.array([value for value in line.scores.values() if np.isfinite(value)])
@@ -163,16 +163,16 @@ def _table(part: Part, lines: Mapping[str, Line], printed: Mapping[str, str]) ->
             continue
         low = bootstrap(interquartile_mean, values)
         middle = number(low.value) + (f" ({number(low.low)} to {number(low.high)})" if len(values) > 1 else "")
-        spread = f" +- {number(float(np.std(values, ddof=1)))}" if len(values) > 1 else ""
+        spread = f" ± {number(float(np.std(values, ddof=1)))}" if len(values) > 1 else ""
         found = paired(reference.scores, line.scores) if line is not reference else None
         less, chance = "-", "-"
         if found is not None:
             half = found.difference.half_width
-            less = number(found.difference.mean) + ("" if half is None else f" +- {number(half)}")
+            less = number(found.difference.mean) + ("" if half is None else f" ± {number(half)}")
             pair = [np.array(list(_turned(one.scores, part.measure).values())) for one in (reference, line)]
             chance = f"{probability_of_improvement(*pair):.2f}" if all(map(len, pair)) else "-"
         seeds = span(*(str(end(line.scores)) for end in (min, max)))
-        row = (f"`{label}`", seeds, middle, f"{number(float(values.mean()))}{spread}", less, chance)
+        row = (label, seeds, middle, f"{number(float(values.mean()))}{spread}", less, chance)
         rows.append((*row, *([printed.get(label, "-")] if printed else [])))
     better = "" if part.measure.higher_is_better else "; less is better"
     return Table(head, rows, f"{part.title}: {part.measure.score_name}{better}")
@@ -190,7 +190,7 @@ def _testbed_table(plan: Plan, figure: Figure, standings: Mapping[str, Standing]
             for fit in found:
                 for kind, judged in fit["kinds"].items():
                     values = (judged[name] for name in ("error", "variance", "ratio", "rank"))
-                    rows.append((f"`{testbed.label}`", fit["environment"], kind, *map(number, values)))
+                    rows.append((testbed.label, fit["environment"], kind, *map(number, values)))
         except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
             raise RunError(f"cannot read {one.path}: {error!r}. What to do: remove it, and run this again.") from error
     return Table(head, rows, "a line for each fit") if rows else None

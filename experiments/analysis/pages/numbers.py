@@ -103,6 +103,8 @@ def values_scale(panel: Panel) -> Scale:
     if panel.ceiling is not None:
         high = max(high, panel.ceiling)
     low = min(0.0, low)
+    if low == high:  # All values are 0.
+        return Scale(0.0, 1.0)
     room = 0.04 * (high - low) or 1.0
     return Scale(low if low == 0 else low - room, high if high == 0 else high + room)
 

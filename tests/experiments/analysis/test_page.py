@@ -444,3 +444,12 @@ def test_colours_stand_out_from_their_ground(mode: str):
     # WCAG: 4.5 for text, which a curve's letter is, too, but in bold and beside its line; 3 for graphics.
     assert min(contrast(name) for name in ("ink", "soft", "link", "yes", "no", "open")) >= 4.5
     assert min(contrast(f"c{i}") for i in range(svg.COLOURS)) >= 3.0
+
+
+def test_a_panel_of_nothing_but_zeros_has_an_axis(tmp_path: Path):
+    # As of a share that no seed has seen any of; an axis of no length would divide by 0.
+    still = page.Panel("Return", "return", [series("still", np.zeros((3, 10)))])
+    text = page.write(report(section(panels=[still])), tmp_path / "out").read_text()
+    path = re.findall(r'<path class="mean [^>]* d="([^"]+)"', text)[0]
+    heights = {pair[1] for pair in re.findall(r"([\d.]+)[ ,]([\d.]+)", path)}
+    assert len(heights) == 1, "level, where the axis says 0"

@@ -23,7 +23,7 @@ def test_ahead_is_the_paired_interval_above_nothing(scores, answer: str):
 
 def test_its_words_have_the_difference_and_its_interval():
     # Differences 0.8, 0.75, 0.85: mean 0.8, deviation 0.05, t(2) = 4.303, so 4.303 * 0.05 / sqrt(3) = 0.124.
-    assert ahead("a", "b").decide({"a": GOOD, "b": BAD})[1] == "a less b: 0.8 +- 0.12 on 3 seeds"
+    assert ahead("a", "b").decide({"a": GOOD, "b": BAD})[1] == "a less b: 0.8 ± 0.12 on 3 seeds"
 
 
 def test_at_most_and_at_least():

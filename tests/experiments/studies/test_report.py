@@ -40,7 +40,7 @@ def test_a_claim_that_holds_and_its_numbers(tmp_path: Path):
     assert panel.ceiling == 0.5  # two of the four squares can be reached
     assert panel.measure == "share seen of 4 squares"
     (table,) = section.tables
-    assert [line[:2] for line in table.lines] == [("`implicit`", "0 to 1"), ("`random`", "0 to 1")]
+    assert [line[:2] for line in table.lines] == [("implicit", "0 to 1"), ("random", "0 to 1")]
     # Both seeds of `implicit` rank above both of `random`.
     assert table.lines[1][-1] == "1.00"
     assert section.command == "python -m experiments.paper a --preset=laptop"
@@ -94,7 +94,7 @@ def test_over_episodes_and_what_the_paper_prints(tmp_path: Path):
 def test_a_return_is_of_the_last_tenth(tmp_path: Path):
     (section,) = make(tmp_path, figure("a", (cell("implicit"),), RETURN), cells={}).sections
     # Of seed 0 it is 1, of seed 1 it is 2.
-    assert section.tables[0].lines[0][3].startswith("1.5 +- 0.71")
+    assert section.tables[0].lines[0][3].startswith("1.5 ± 0.71")
 
 
 def test_runs_of_one_cell_may_differ_in_their_seed_alone(tmp_path: Path):
