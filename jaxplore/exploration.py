@@ -213,9 +213,10 @@ def act_uniformly(agent: Agent, key: Key, obs: Array) -> Array:
 
 def observe(state: ExplorerState, transitions: Transition, valid: Array) -> ExplorerState:
     """Take real transitions `[T, ...]` in where `valid [T]` is set; nothing is learned yet."""
+    data = replay.add(state.data, transitions, valid)
     updated = dynamics.update_normalizers(state.normalizers, transitions, valid)
     normalizers = jax.tree.map(lambda new, old: jnp.where(state.frozen, old, new), updated, state.normalizers)
-    return dataclasses.replace(state, data=replay.add(state.data, transitions, valid), normalizers=normalizers)
+    return dataclasses.replace(state, data=data, normalizers=normalizers)
 
 
 def improve(agent: Agent, key: Key, state: ExplorerState, obs: Array, num_data: Array) -> tuple[ExplorerState, Metrics]:

@@ -39,7 +39,7 @@ class CommandLine:
     parent: str | None = None
     """Start from the policy of another run: DIRECTORY, once it is finished, or DIRECTORY@STEP, any checkpoint of it.
     With it come the form of its network and its observation statistics, which stay as they are; critics are new and
-    there are no data. --steps are this run's own; without it they are the preset's less those that the parent took.
+    there are no data. The parent's steps are not among this run's, which by default are the preset's less those.
     For methods on the task's reward."""
     wandb: str | None = None
     """Also log to this project of Weights & Biases; WANDB_MODE=offline keeps it on this machine."""
