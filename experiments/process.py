@@ -54,6 +54,15 @@ def be_brief() -> None:
             usual(kind, error, where)
 
     sys.excepthook = hook
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _stop_at_once)
+
+
+def _stop_at_once(number: int, frame: FrameType | None) -> None:
+    # While modules are imported. An exception would not do: packages catch it where they try what can be imported, and
+    # C code reports it and raises another.
+    os.write(2, b"\nStopped.\n")
+    os._exit(INTERRUPTED)
 
 
 def carry_out(main: Callable[[], int]) -> None:
@@ -66,6 +75,8 @@ def carry_out(main: Callable[[], int]) -> None:
     sys.stdout, sys.stderr = _Patient(sys.stdout), _Patient(sys.stderr)
     if threading.current_thread() is threading.main_thread():
         signal.signal(signal.SIGTERM, _terminate)
+        if signal.getsignal(signal.SIGINT) is _stop_at_once:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         if hasattr(signal, "SIGHUP"):
             signal.signal(signal.SIGHUP, signal.SIG_IGN)
         if os.environ.pop(HELD, None):

@@ -29,6 +29,13 @@ def test_ctrl_c_while_modules_are_imported_is_a_line():
     assert process.returncode in (-signal.SIGINT, 130)
 
 
+def test_ctrl_c_in_an_import_that_catches_everything_is_heeded():
+    caught = "try: os.kill(os.getpid(), signal.SIGINT); time.sleep(5)\nexcept BaseException: print('caught')"
+    program = f"import os, signal, time\nfrom experiments import process\nprocess.be_brief()\n{caught}"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert (done.stdout, done.stderr, done.returncode) == ("", "\nStopped.\n", 130)
+
+
 def test_sigterm_says_how_to_go_on(tmp_path: Path):
     out = tmp_path / "run"
     with start([*RUN, "--steps=1000000", f"--out={out}"]) as process:
