@@ -17,7 +17,7 @@ from experiments.runs import modules
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError, disk_error
 from experiments.runs.files import replacing
-from experiments.runs.rows import FIELDS
+from experiments.runs.rows import in_order
 from experiments.runs.seeds import expand
 from experiments.runs.status import Status
 
@@ -38,11 +38,9 @@ def to_csv(runs: Sequence[Path]) -> str:
         if directory.status() is Status.ABSENT:
             raise RunError(f"{run} holds no run (no config.json). Give the --out of a run.")
         rows += [{RUN: str(run), **row} if len(runs) > 1 else row for row in directory.rows()]
-    found = dict.fromkeys(name for row in rows for name in row)
-    # The schema's order; what it does not know, a method's own fields, comes last.
-    columns = [name for name in (RUN, *FIELDS) if name in found]
+    columns = in_order((name for row in rows for name in row), (RUN,))
     text = io.StringIO()
-    writer = csv.DictWriter(text, [*columns, *(name for name in found if name not in columns)], lineterminator="\n")
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()

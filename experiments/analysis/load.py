@@ -10,7 +10,7 @@ import numpy as np
 from experiments.runs.config import RunConfig
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
-from experiments.runs.rows import FIELDS, check
+from experiments.runs.rows import check, in_order
 from experiments.runs.scene import Scene
 from experiments.runs.schedule import gap
 from experiments.runs.status import Status
@@ -128,9 +128,8 @@ def columns(
         config = run.config
         own = {"name": name or config.method, "run": str(path), "env": config.env, "method": config.method}
         table += [{**own, "preset": config.preset, **row} for row in run.rows]
-    found = dict.fromkeys(field for row in table for field in row)
-    order = [field for field in ("name", "run", "env", "method", "preset", *FIELDS) if field in found]
-    return {field: _column([row.get(field) for row in table]) for field in dict.fromkeys([*order, *found])}
+    order = in_order((field for row in table for field in row), ("name", "run", "env", "method", "preset"))
+    return {field: _column([row.get(field) for row in table]) for field in order}
 
 
 def _column(values: Sequence[Any]) -> np.ndarray:

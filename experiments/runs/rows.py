@@ -6,7 +6,7 @@ belief, `eval/` an evaluation's.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from jaxplore.validate import FieldError
@@ -156,3 +156,11 @@ def tensorboard_tag(name: str) -> str:
         return name
     group = FIELDS[name].group if name in FIELDS else "other"
     return f"{group}/{name.removeprefix(f'{group}_')}"
+
+
+def in_order(found: Iterable[str], first: Sequence[str] = ()) -> list[str]:
+    """Names of columns, each once: `first`, then the schema's in its order, then what it does not know, such as a
+    method's own fields. Only those that were `found`.
+    """
+    names = dict.fromkeys(found)
+    return list(dict.fromkeys([*(name for name in (*first, *FIELDS) if name in names), *names]))

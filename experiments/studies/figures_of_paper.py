@@ -4,7 +4,6 @@ Ratzlaff, Bai, Li, Xu, "Implicit Generative Modeling for Efficient Exploration",
 beyond it.
 """
 
-import dataclasses
 from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
@@ -342,9 +341,6 @@ def choose(names: tuple[str, ...]) -> list[Figure]:
 def config_of(cell: Cell, preset: str) -> RunConfig:
     """The configuration of a cell's runs: its first seed, and how many there are.
 
-    Settings that this version has no field for (`warm_up`, which policy acts first) are left to their defaults; a cell
-    without a warm-up then has the shortest that there is.
-
     Args:
         cell: of a figure.
         preset: `laptop`, `paper` or `smoke`.
@@ -352,7 +348,6 @@ def config_of(cell: Cell, preset: str) -> RunConfig:
     Raises:
         FieldError: the cell sets a field that is not known, or to a value that is refused.
     """
-    known = {item.name for item in dataclasses.fields(RunConfig)}
     config = preset_config(preset, cell.env, cell.method)
     changes: dict[str, Any] = {
         "steps": cell.steps[preset],
@@ -360,11 +355,9 @@ def config_of(cell: Cell, preset: str) -> RunConfig:
     }
     for more in (cell.settings, cell.by_preset.get(preset, {})):
         changes = _merge(changes, more)
-    if cell.warm_up == "none":
-        changes = _merge(changes, {"explorer": {"warm_up_steps": 0 if "warm_up" in known else 1}})
-    if cell.keep_at and "keep_at" in known:
+    if cell.keep_at:
         changes["keep_at"] = cell.keep_at[preset]
-    if cell.warm_up is not None and "warm_up" in known:
+    if cell.warm_up is not None:
         changes["warm_up"] = cell.warm_up
     return replace(config, changes)
 

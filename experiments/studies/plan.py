@@ -136,20 +136,15 @@ def _add(
     figure: str,
     *,
     needs_walk: bool = False,
-    until: int | None = None,
 ) -> tuple[str, ...]:
     """Put the runs of a cell among the jobs, its parent's before them, and give their keys."""
     config = config_of(cell, preset)
-    if until is not None:
-        config = dataclasses.replace(config, steps=until)
     env = _environment(config)
     config = dataclasses.replace(config, backend=env.backend)
     parents: tuple[str, ...] = ()
     at = cell.parent_at.get(preset)
     if cell.parent is not None:
-        # Where checkpoints can be kept for good, one run has all lengths.
-        can_keep = "keep_at" in {item.name for item in dataclasses.fields(RunConfig)}
-        parents = _add(cell.parent, preset, out, jobs, figure, until=None if can_keep else at)
+        parents = _add(cell.parent, preset, out, jobs, figure)
     together = env.compiled or preset == "smoke"
     first = dataclasses.replace(config, num_seeds=1)
     seeds = range(config.seed, _end(config))
@@ -388,7 +383,7 @@ def size(job: Job) -> Size:
     config = job.spec.config
     state = config.num_seeds * (_traced(_unseeded(config)) if config.preset == "paper" else _usual(config))
     rounds = math.ceil(config.steps / config.explorer.steps_per_round)
-    checkpoints = 3 + len(getattr(config, "keep_at", ()))
+    checkpoints = 3 + len(config.keep_at)
     return Size(PROCESS + PER_STATE * state, checkpoints * state + config.num_seeds * rounds * ROW)
 
 

@@ -100,8 +100,7 @@ def plot_intrinsic_reward(
             lambda group: name_of(group, curves) + _smoothed(group, curves),
         )
         for axes, *_ in panels:
-            axes.grid(axis="y", color="#e4e4e4", linewidth=0.7)
-            axes.set_axisbelow(True)
+            _grid(axes)
         drawn = np.concatenate([group.values[np.isfinite(group.values)] for group in curves])
         # All panels have the same axis.
         _scale(panels[0].axes, drawn)
@@ -134,9 +133,13 @@ def plot_return(path: str | os.PathLike[str], curves: Sequence[Curves], *, title
             for line, group in zip(bold, own, strict=True):
                 low, high = _t_bounds(group.values)
                 axes.fill_between(group.steps, low, high, color=line.get_color(), alpha=0.15, linewidth=0)
-            axes.grid(axis="y", color="#e4e4e4", linewidth=0.7)
-            axes.set_axisbelow(True)
+            _grid(axes)
         finish(path, figure, panels, quantity="return", title=title, middle="mean")
+
+
+def _grid(axes: Axes) -> None:
+    axes.grid(axis="y", color="#e4e4e4", linewidth=0.7)
+    axes.set_axisbelow(True)
 
 
 def _t_bounds(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

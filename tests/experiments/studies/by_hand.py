@@ -25,6 +25,11 @@ def cell(method: str, label: str = "", env: str = "ant_maze", seeds: int = 2, **
     return Cell(label or method, env, method, seeds, STEPS, **fields)
 
 
+SHORT = {"explorer": {"warm_up_steps": 50, "data_capacity": 1_000}}
+PARENT = cell("disagreement", env="half_cheetah_task")
+CHILD = cell("sac", "ours", "half_cheetah_task", parent=PARENT, settings=SHORT)
+
+
 def figure(name: str, cells: tuple[Cell, ...], measure: Measure = COVERAGE, conditions: tuple[Condition, ...] = ()):
     return Figure(name, name.title(), "Figure 0", "It is so.", (Part("A part", measure, cells),), conditions)
 

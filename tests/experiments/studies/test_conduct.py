@@ -9,11 +9,8 @@ from experiments.studies import conduct, execute, plan
 from experiments.studies.conduct import Executor
 from experiments.studies.execute import End
 from experiments.studies.plan import Job, State
-from tests.experiments.studies.by_hand import cell, figure, finish
+from tests.experiments.studies.by_hand import CHILD, cell, figure, finish
 
-SHORT = {"explorer": {"warm_up_steps": 50, "data_capacity": 1_000}}
-PARENT = cell("disagreement", env="half_cheetah_task")
-CHILD = cell("sac", "ours", "half_cheetah_task", parent=PARENT, settings=SHORT)
 KILLED, WRONG = End(-9, "it was ended by SIGKILL"), End(1, "the disk is full")
 
 

@@ -13,11 +13,7 @@ from experiments.runs.errors import RunError
 from experiments.runs.spec import to_json
 from experiments.studies import figures_of_paper, plan
 from experiments.studies.plan import State
-from tests.experiments.studies.by_hand import VISITS, cell, figure, finish
-
-SHORT = {"explorer": {"warm_up_steps": 50, "data_capacity": 1_000}}
-PARENT = cell("disagreement", env="half_cheetah_task")
-CHILD = cell("sac", "ours", "half_cheetah_task", parent=PARENT, settings=SHORT)
+from tests.experiments.studies.by_hand import CHILD, VISITS, cell, figure, finish
 
 
 def test_a_run_that_two_figures_need_is_one_job(tmp_path: Path):
