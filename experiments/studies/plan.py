@@ -496,10 +496,9 @@ def describe(plan: Plan, standings: Mapping[str, Standing], known: Rates, at_a_t
     text += [f"{plan.jobs[key].name} diverged: {one.reason}" for key, one in standings.items() if one.reason]
     if len(plan.jobs) > done:
         side = f", {at_a_time} at a time: {duration(total / at_a_time)}" if at_a_time else ""
-        lacking = f"; {unknown} runs are of a kind that has not been run here, and come on top" if unknown else ""
-        text.append(
-            f"left: {duration(total)} of computing{side}{lacking}; up to {largest / 2**30:.1f} GiB of memory each"
-        )
+        parts = [f"{duration(total)} of computing{side}"] if total else []
+        parts += [f"{unknown} runs of a kind that has not been run here, so their time is not known"] if unknown else []
+        text.append(f"left: {'; '.join(parts)}; up to {largest / 2**30:.1f} GiB of memory each")
     return "\n\n".join(text)
 
 

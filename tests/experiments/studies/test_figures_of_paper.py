@@ -29,6 +29,7 @@ def test_every_cell_makes_a_configuration(preset: str):
         config = config_of(cell, preset)
         assert (config.env, config.method, config.preset) == (cell.env, cell.method, preset)
         assert config.num_seeds == (2 if preset == "smoke" else cell.seeds)
+        assert config.seed == (20 if preset == "laptop" else 0)
 
 
 def test_the_papers_seeds_and_steps():

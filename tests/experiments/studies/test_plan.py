@@ -190,8 +190,9 @@ def test_the_time_is_that_of_runs_of_before(tmp_path: Path):
     found = plan.look_all(made)
     assert [plan.seconds_left(job, found[job.key], known) for job in jobs] == [0.0, pytest.approx(3.0), None, None]
     text = plan.describe(made, found, known, 2)
-    assert "left: 3 s of computing, 2 at a time: 2 s; 2 runs are of a kind that has not been run here" in text
+    assert "left: 3 s of computing, 2 at a time: 2 s; 2 runs of a kind that has not been run here" in text
     assert "no run to tell from" in text
+    assert "left: 3 runs of a kind that has not been run here" in plan.describe(made, found, {})
 
 
 def test_the_state_of_the_papers_networks_is_traced(tmp_path: Path):
