@@ -1,8 +1,8 @@
-"""One report of many runs as a page to read: `index.html`, the same as Markdown, and every curve as CSV."""
+"""One report of many runs: a page to read, `index.html`; the same as Markdown, with pictures; and every curve as CSV."""
 
 from pathlib import Path
 
-from experiments.analysis.pages import csv, html, markdown
+from experiments.analysis.pages import csv, html, markdown, picture
 from experiments.analysis.pages.contents import (
     FloorVisits,
     Panel,
@@ -21,7 +21,8 @@ __all__ = ["FloorVisits", "Panel", "Report", "Section", "Series", "Table", "Verd
 
 
 def write(report: Report, out: Path, refresh: float | None = None) -> Path:
-    """Writes `index.html`, `report.md` and `csv/NAME.csv` in `out`, each replaced as a whole, the page last.
+    """Writes `index.html`, `report.md`, `pictures/NAME.svg` and `csv/NAME.csv` in `out`, each replaced as a whole, the
+    page last.
 
     The page needs no network and no other file: it shows and saves the values that it holds, at most 300 points of a
     curve with four digits. The CSV files, which it links to, have every point with all digits.
@@ -42,11 +43,11 @@ def write(report: Report, out: Path, refresh: float | None = None) -> Path:
     if refresh is not None and not refresh > 0:
         raise ValueError(f"refresh is {refresh}; must be above 0, in seconds, or None")
     page = out / "index.html"
-    files = {
-        out / "csv" / f"{name}.csv": csv.text(panel)
-        for section in report.sections
-        for panel, name in zip(section.panels, panel_names(section), strict=True)
-    }
+    files: dict[Path, str] = {}
+    for section in report.sections:
+        for panel, name in zip(section.panels, panel_names(section), strict=True):
+            files[out / "csv" / f"{name}.csv"] = csv.text(panel)
+            files[out / "pictures" / f"{name}.svg"] = picture.text(panel)
     files |= {out / "report.md": markdown.text(report), page: html.text(report, refresh)}
     for path, text in files.items():
         try:

@@ -11,8 +11,6 @@ from experiments.analysis.pages.contents import FloorVisits, Panel, Report, Sect
 from experiments.analysis.pages.markdown import MARKS
 from experiments.analysis.pages.numbers import finite, steps_scale, summary, thin, values_scale
 
-MOST_IN_PICTURE = 7
-"""So many series share a picture; of more each gets its own, with the others in grey."""
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 """The browser is told that the page loads nothing."""
 LOG = " The axis of values is logarithmic: a band that would reach 0 ends at the bottom."
@@ -92,7 +90,7 @@ def _curves(panel: Panel, name: str, file: str) -> str:
     x, y = steps_scale(panel), values_scale(panel)
     thinned = [thin(one) for one in panel.series]
     lines = [svg.Line(i, one.label, one.steps, summary(one.values)) for i, one in enumerate(thinned)]
-    many = len(lines) > MOST_IN_PICTURE
+    many = len(lines) > svg.MOST_IN_PICTURE
     frame = svg.SMALL if many else svg.WHOLE
     if many:
         shared = f"{name}-all"

@@ -1,6 +1,6 @@
 """What the page looks like, and what it does: a style sheet and a script, both part of the page."""
 
-STYLE = """
+COLOURS = """
 :root{--ink:#1d2126;--soft:#59616b;--paper:#fff;--rim:#d5dae0;--grid:#e6e9ed;--other:#c3c9d0;--link:#0b5cad;
 --c0:#0072b2;--c1:#c94f00;--c2:#00805c;--c3:#b0487f;--c4:#946200;--c5:#2585bd;--c6:#222;
 --yes:#00694b;--no:#a63a00;--open:#5c4a9c;--wall:#c9ced4;
@@ -9,6 +9,29 @@ STYLE = """
 --other:#4d565f;--link:#7db8f5;--c0:#4fadf0;--c1:#ff8d45;--c2:#2ecc9c;--c3:#ec9bc7;--c4:#e8b33a;--c5:#9bd4fa;--c6:#f0f0f0;
 --yes:#4bd6a8;--no:#ff9d63;--open:#b9a8f5;--wall:#444c55;
 --v1:#173249;--v2:#1d4d73;--v3:#2a6fa3;--v4:#4594cf;--v5:#83bfea;--v6:#d9effd}}
+"""
+"""CSS variables, so that every picture follows the reader's choice of light or dark. `c0` to `c6` can be told apart
+with any kind of colour vision and stand out from their ground by 3:1 or more."""
+
+PICTURES = """
+svg text{font-size:11px;fill:var(--soft)}
+text.x{text-anchor:middle}text.y,text.last{text-anchor:end}text.none{text-anchor:middle}
+svg path{fill:none}
+.grid{stroke:var(--grid);stroke-width:1}.axis,.tick{stroke:var(--soft);stroke-width:1}
+.ceiling{stroke:var(--soft);stroke-width:1;stroke-dasharray:2 3}
+.mean{stroke:var(--c);stroke-width:2;stroke-linejoin:round;stroke-linecap:round}.dash.mean{stroke-dasharray:5 4}
+svg .band{fill:var(--c);fill-opacity:.16}.seed{stroke:var(--c);stroke-width:.7;stroke-opacity:.75}
+.others{fill:none;stroke:var(--other);stroke-width:.7}
+svg text.key{fill:var(--c);font-weight:700}
+.c0{--c:var(--c0)}.c1{--c:var(--c1)}.c2{--c:var(--c2)}.c3{--c:var(--c3)}.c4{--c:var(--c4)}.c5{--c:var(--c5)}.c6{--c:var(--c6)}
+.cursor{stroke:var(--ink);stroke-width:1;stroke-dasharray:3 2}svg .dot{fill:var(--c);stroke:var(--paper)}
+svg .wall{fill:var(--wall)}.cell{stroke:var(--soft);stroke-width:.6}svg .here{stroke:var(--no);stroke-width:2}
+[class^=v]{shape-rendering:crispEdges}svg .v1{fill:var(--v1)}svg .v2{fill:var(--v2)}svg .v3{fill:var(--v3)}
+svg .v4{fill:var(--v4)}svg .v5{fill:var(--v5)}svg .v6{fill:var(--v6)}
+"""
+"""Of what is drawn, on the page and in files of their own."""
+
+_PAGE = """
 *{box-sizing:border-box}
 body{margin:0 auto;padding:16px;max-width:1200px;background:var(--paper);color:var(--ink);
 font:16px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,"DejaVu Sans",sans-serif;overflow-wrap:anywhere}
@@ -33,22 +56,10 @@ figure{margin:0;min-width:0}.wide{grid-column:1/-1}
 .many{display:grid;grid-template-columns:repeat(auto-fill,minmax(150px,1fr));gap:12px;align-items:end}
 .one p{font-size:.75rem;margin:0;display:flex;align-items:center;gap:4px}.one p svg{flex:none;margin:0}
 .many .box{top:auto;bottom:100%}
-svg text{font-size:11px;fill:var(--soft)}
+"""
+_AROUND = """
 @container (min-width:410px){svg text{font-size:9.5px}}
 @container (max-width:240px) and (min-width:181px){svg text{font-size:10px}}
-text.x{text-anchor:middle}text.y,text.last{text-anchor:end}text.none{text-anchor:middle}
-svg path{fill:none}
-.grid{stroke:var(--grid);stroke-width:1}.axis,.tick{stroke:var(--soft);stroke-width:1}
-.ceiling{stroke:var(--soft);stroke-width:1;stroke-dasharray:2 3}
-.mean{stroke:var(--c);stroke-width:2;stroke-linejoin:round;stroke-linecap:round}.dash.mean{stroke-dasharray:5 4}
-svg .band{fill:var(--c);fill-opacity:.16}.seed{stroke:var(--c);stroke-width:.7;stroke-opacity:.75}
-.others{fill:none;stroke:var(--other);stroke-width:.7}
-svg text.key{fill:var(--c);font-weight:700}
-.c0{--c:var(--c0)}.c1{--c:var(--c1)}.c2{--c:var(--c2)}.c3{--c:var(--c3)}.c4{--c:var(--c4)}.c5{--c:var(--c5)}.c6{--c:var(--c6)}
-.cursor{stroke:var(--ink);stroke-width:1;stroke-dasharray:3 2}svg .dot{fill:var(--c);stroke:var(--paper)}
-svg .wall{fill:var(--wall)}.cell{stroke:var(--soft);stroke-width:.6}svg .here{stroke:var(--no);stroke-width:2}
-[class^=v]{shape-rendering:crispEdges}svg .v1{fill:var(--v1)}svg .v2{fill:var(--v2)}svg .v3{fill:var(--v3)}
-svg .v4{fill:var(--v4)}svg .v5{fill:var(--v5)}svg .v6{fill:var(--v6)}
 .legend{display:flex;flex-wrap:wrap;gap:2px 16px;list-style:none;margin:.3em 0;padding:0;font-size:.875rem}
 .legend b,.one b,.box b{color:var(--c)}.sample{width:22px;height:8px;margin-right:5px}
 .swatch{width:12px;height:12px;margin-right:4px}
@@ -71,8 +82,8 @@ font-size:.8125rem;overflow-wrap:normal}
 @media (prefers-reduced-motion:no-preference){html{scroll-behavior:smooth}}
 @media print{.tools{display:none}}
 """
-"""Colours are CSS variables, so that every picture follows the reader's choice of light or dark. `c0` to `c6` can be
-told apart with any kind of colour vision and stand out from their ground by 3:1 or more."""
+STYLE = f"{COLOURS}{_PAGE}{PICTURES}{_AROUND}"
+"""The whole sheet; what is last wins."""
 
 SCRIPT = r"""
 (() => {

@@ -1,4 +1,4 @@
-"""A report as Markdown, for a repository's page: the same words and tables; the pictures are in `index.html`."""
+"""A report as Markdown, for a repository's page: the same words and tables, and pictures that only show."""
 
 import re
 
@@ -13,7 +13,7 @@ MARKS = {"holds": "✓", "does not hold": "✗", "undecided": "?", "not run": "o
 def text(report: Report) -> str:
     """The whole report."""
     parts = [f"# {plain(report.title)}", plain(report.made), *(f"- {plain(note)}" for note in report.notes)]
-    parts.append("Pictures to read values off, every seed's curves among them: [index.html](index.html).")
+    parts.append("To read values off, with every seed's curve: [index.html](index.html).")
     lines = [
         (f"[{plain(one.title)}](#{slug(one.name)})", plain(one.source), f"{MARKS[one.verdict]} {one.verdict}")
         for one in report.sections
@@ -41,7 +41,8 @@ def _section(section: Section) -> str:
     ]
     for panel, name in zip(section.panels, panel_names(section), strict=True):
         own = floor.table(panel) if isinstance(panel, FloorVisits) else curves.table(panel)
-        parts += [f"### {plain(panel.title)}", _table(own), f"[All of it as CSV](csv/{name}.csv)"]
+        parts += [f"### {plain(panel.title)}", f"![{plain(panel.title)}](pictures/{name}.svg)", _table(own)]
+        parts.append(f"[All of it as CSV](csv/{name}.csv)")
     parts += map(_table, section.tables)
     if section.facts:
         parts.append("\n".join(f"- {plain(name)}: {plain(value)}" for name, value in section.facts.items()))

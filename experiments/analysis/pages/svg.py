@@ -11,6 +11,9 @@ from experiments.analysis.pages.numbers import Scale, Summary, short, step_name,
 COLOURS = 7
 """The page's `--c0` to `--c6`; further series have them again, dashed."""
 
+MOST_IN_PICTURE = 7
+"""So many series share a picture; of more each gets its own, with the others in grey."""
+
 
 class Frame(NamedTuple):
     """A picture's size, and the box in it that values are drawn in."""

@@ -7,6 +7,7 @@ import math
 import re
 import shutil
 import subprocess
+import xml.etree.ElementTree as ElementTree
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -97,7 +98,8 @@ def test_it_writes_a_page_markdown_and_csv_and_leaves_no_drafts(tmp_path: Path):
     path = page.write(report(), tmp_path / "new" / "report")
     assert path == tmp_path / "new" / "report" / "index.html"
     names = sorted(one.relative_to(path.parent).as_posix() for one in path.parent.rglob("*") if one.is_file())
-    assert names == ["csv/figure_5-1.csv", "csv/figure_5-2.csv", "index.html", "report.md"]
+    pictures = ["pictures/figure_5-1.svg", "pictures/figure_5-2.svg"]
+    assert names == ["csv/figure_5-1.csv", "csv/figure_5-2.csv", "index.html", *pictures, "report.md"]
 
 
 def test_it_is_well_formed_and_needs_nothing_else(tmp_path: Path):
@@ -313,8 +315,30 @@ def test_markdown_has_all_of_it(tmp_path: Path):
     text = (tmp_path / "report.md").read_text(encoding="utf-8")
     for part in ("# A report", "It is ahead.", "✓ holds", "```\nrun it\n```", "- seeds: 0 to 2", "| implicit | 7 |"):
         assert part in text
-    assert all((tmp_path / link).is_file() for link in re.findall(r"\]\((csv/[^)]+)\)", text))
-    assert text.count("](csv/") == 2
+    assert all((tmp_path / link).is_file() for link in re.findall(r"\]\(((?:csv|pictures)/[^)]+)\)", text))
+    assert text.count("](csv/") == text.count("](pictures/") == 2
+
+
+@pytest.mark.parametrize("count", [1, 7, 8, 11])
+def test_pictures_in_files_of_their_own_need_nothing_else(tmp_path: Path, count: int):
+    labels = [f"ours with a long name {i}{HOSTILE}" for i in range(count)]
+    panel = page.Panel("Coverage", "share", [series(label, VALUES / (i + 1)) for i, label in enumerate(labels)])
+    page.write(report(section(panels=[panel])), tmp_path)
+    root = ElementTree.parse(tmp_path / "pictures" / "figure_5.svg").getroot()
+    drawn = list(root.iter())
+    # Each series once, with its name, inside the picture and below no other's.
+    names = [one for one in drawn if one.text in labels]
+    assert [one.text for one in names] == labels
+    places = [(float(one.attrib["x"]), float(one.attrib["y"])) for one in names]
+    assert len(set(places)) == count
+    _, _, width, height = map(float, root.attrib["viewBox"].split())
+    assert all(0 <= x < width and 0 < y < height for x, y in places)
+    means = [one for one in drawn if "data-series" in one.attrib and one.tag.endswith("path")]
+    assert [one.attrib["data-series"] for one in means] == [str(i) for i in range(count)]
+    ids = {one.attrib["id"] for one in drawn if "id" in one.attrib}
+    assert {one.attrib["href"][1:] for one in drawn if "href" in one.attrib} <= ids
+    text = (tmp_path / "pictures" / "figure_5.svg").read_text(encoding="utf-8")
+    assert "//" not in text.replace('xmlns="http://www.w3.org/2000/svg"', "") and "prefers-color-scheme:dark" in text
 
 
 def test_refresh(tmp_path: Path):
