@@ -1,4 +1,4 @@
-"""One report of many runs: a page to read, `index.html`; the same as Markdown, with pictures; and every curve as CSV."""
+"""One report of many runs: a page to read, `index.html`; the same as Markdown, with pictures; every curve as CSV."""
 
 from pathlib import Path
 
