@@ -17,7 +17,13 @@ NO_REWARD = ("ddqn", "psne", "psne_no_norm", "sac", "sac_v2", "sac_explorer", "r
 """Methods without an intrinsic reward."""
 
 
-@pytest.mark.parametrize("name", METHODS)
+ONE_OF_EACH = ("implicit", "max", "icm", "disagreement_grad", "rnd", "rnd_active", "ddqn", "psne", "sac", "random")
+"""Every kind of signal and of behaviour; the others are further pairs of these."""
+
+
+@pytest.mark.parametrize(
+    "name", [name if name in ONE_OF_EACH else pytest.param(name, marks=pytest.mark.slow) for name in METHODS]
+)
 def test_runs_to_the_end_and_reports_what_the_schema_says(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

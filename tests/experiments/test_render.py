@@ -44,7 +44,8 @@ def test_a_run_becomes_a_video(finished, renderer: str, tmp_path: Path):
     done = command(finished.out, "--steps=20", "--camera=overview", *size, f"--out={path}", MUJOCO_GL=renderer)
     assert done.returncode == 0, done.stderr
     assert done.stdout == f"implicit on ant_maze after 81 steps, 20 steps of acting: {path}\n"
-    assert done.stderr == ""
+    # A machine that is busy takes long enough for progress to be told.
+    assert all(line.startswith("drawing") for line in done.stderr.splitlines()), done.stderr
     assert [entry.name for entry in tmp_path.iterdir()] == ["ant.mp4"]
     assert sorted(path.name for path in finished.out.iterdir()) == before, "the run is as it was"
     assert ffmpeg.count_frames_and_secs(path) == (21, pytest.approx(21 / 20)), "in real time"

@@ -81,6 +81,7 @@ def test_killed_between_checkpoints(tell, point: str, whole: Path, tmp_path: Pat
     assert_same_run(whole, out)
 
 
+@pytest.mark.slow
 def test_killed_over_and_over(tell, point: str, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """In this process, at each of the moments at which a round touches the disk, time and again."""
 
@@ -112,6 +113,7 @@ def test_killed_over_and_over(tell, point: str, whole: Path, tmp_path: Path, mon
     assert_same_run(whole, out)
 
 
+@pytest.mark.slow
 def test_killed_before_the_first_checkpoint_a_run_starts_over(tell, point: str, whole: Path, tmp_path: Path):
     out = tmp_path / "run"
     killed(out, "checkpoint.sync", 0, *POINT)
@@ -142,6 +144,7 @@ def test_kill_9_while_saving_the_ant(tell, finished, tmp_path: Path):
     assert sorted(path.name for path in (out / "checkpoints").iterdir()) == ["75", "81"]
 
 
+@pytest.mark.slow
 def test_a_damaged_checkpoint_falls_back_and_ends_the_same(
     tell, point: str, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ):

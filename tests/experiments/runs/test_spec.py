@@ -143,12 +143,12 @@ def test_what_was_chosen_for_the_generator_is_not_static_networks():
     assert (proposed.fit.lr, static.fit.lr) == (6e-3, 3e-3)
     assert (proposed.sac.alpha, static.sac.alpha) == (0.05, 0.02)
     assert dataclasses.replace(proposed, fit=static.fit, sac=static.sac) == static
-    assert preset_config("laptop", "ant_maze", "max").explorer.sac.alpha == 0.1
-    assert preset_config("laptop", "acrobot", "max").explorer.sac.alpha == 0.02
+    assert preset_config("laptop", "acrobot", "max").explorer.sac.alpha == 0.1, "chosen in the maze, for all"
     assert preset_config("laptop", "ant_maze", "max_trajectory").explorer.sac.alpha == 0.2, "its authors' own"
     for method in ("implicit_reactive", "implicit_grad"):
         assert preset_config("laptop", "ant_maze", method).explorer.fit.lr == 6e-3
-    assert preset_config("laptop", "ant_maze", "random").explorer.fit.lr == 3e-3
+    for env, method in (("ant_maze", "random"), ("acrobot", "implicit"), ("mountain_car", "implicit")):
+        assert preset_config("laptop", env, method).explorer.fit.lr == 3e-3, "no bootstrap, no other rate"
     assert preset_config("paper", "ant_maze").explorer.fit == preset_config("paper", "ant_maze", "max").explorer.fit
 
 

@@ -242,6 +242,7 @@ def test_without_out_they_make_a_place_of_their_own(here, point: str, tmp_path: 
 # Resumed.
 
 
+@pytest.mark.slow
 def test_what_is_finished_is_kept_and_the_rest_goes_on(here, tell, point: str, tmp_path: Path):
     out = tmp_path / "run"
     here.fails = {1: lambda: End(-9, "killed"), 2: lambda: End(1, "the disk is full")}
@@ -279,6 +280,7 @@ def test_more_steps_and_more_seeds(here, tell, point: str, tmp_path: Path):
     assert "Resume with the saved values (or more steps or seeds)" in told.stderr
 
 
+@pytest.mark.slow
 def test_seeds_that_share_a_directory_go_on_sharing_it(here, tell, point: str, tmp_path: Path):
     out = tmp_path / "run"
     assert tell(out, *RANDOM, "--num-seeds=2").status == 0
