@@ -54,8 +54,8 @@ LAPTOP = ExplorationConfig(
     rnd=RNDConfig(hidden=(64, 64), features=64, lr=1e-3),
     ppo=PPOConfig(hidden=(64, 64), rollout_steps=128, epochs=4, minibatch_size=32),
 )
-"""Settings for a laptop without a GPU: many small generators, whose features cannot die and which each see data of their
-own, and a policy that learns from what happened. See `experiments/results/ant_maze_laptop/TUNING.md`."""
+"""Settings for a laptop without a GPU: many small generators, whose features cannot die and which each see data of
+their own, and a policy that learns from what happened. See `experiments/results/ant_maze_laptop/TUNING.md`."""
 
 WITHOUT_BOOTSTRAP = dataclasses.replace(LAPTOP, generator=dataclasses.replace(LAPTOP.generator, bootstrap="none"))
 """For physics that leaves nothing to chance, where weights on the data cost the most accuracy."""
@@ -147,8 +147,8 @@ BOOTSTRAPPED_LR = 6e-3
 """Learning rate of the laptop's generators where they have a bootstrap. Static networks were never tried at it."""
 
 CHOSEN_ALPHA: dict[str, dict[str, float]] = {"laptop": {"disagreement": 0.02, "icm": 0.02, "max": 0.1}}
-"""Preset -> method -> SAC's weight of entropy, where one was chosen for it, in the maze, by a search of the same size as
-the others', and is not the preset's."""
+"""Preset -> method -> SAC's weight of entropy, where one was chosen for it, in the maze, by a search of the same size
+as the others', and is not the preset's."""
 
 TASK_RUN = {"steps": 1_000_000, "checkpoint_every": 10_000, "eval_every": 5_000}
 """A million steps, as the paper has them, evaluated every 5,000."""

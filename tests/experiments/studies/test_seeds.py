@@ -242,7 +242,6 @@ def test_without_out_they_make_a_place_of_their_own(here, point: str, tmp_path: 
 # Resumed.
 
 
-@pytest.mark.slow
 def test_what_is_finished_is_kept_and_the_rest_goes_on(here, tell, point: str, tmp_path: Path):
     out = tmp_path / "run"
     here.fails = {1: lambda: End(-9, "killed"), 2: lambda: End(1, "the disk is full")}
@@ -267,6 +266,7 @@ def test_what_is_finished_is_kept_and_the_rest_goes_on(here, tell, point: str, t
     assert here == []
 
 
+@pytest.mark.slow
 def test_more_steps_and_more_seeds(here, tell, point: str, tmp_path: Path):
     out = tmp_path / "run"
     assert tell(out, *RANDOM, "--num-seeds=2", "--processes=2").status == 0
@@ -280,7 +280,6 @@ def test_more_steps_and_more_seeds(here, tell, point: str, tmp_path: Path):
     assert "Resume with the saved values (or more steps or seeds)" in told.stderr
 
 
-@pytest.mark.slow
 def test_seeds_that_share_a_directory_go_on_sharing_it(here, tell, point: str, tmp_path: Path):
     out = tmp_path / "run"
     assert tell(out, *RANDOM, "--num-seeds=2").status == 0
@@ -294,6 +293,7 @@ def test_seeds_that_share_a_directory_go_on_sharing_it(here, tell, point: str, t
     assert f"--out={out} holds another run" in tell(out, *RANDOM, *SPLIT).stderr
 
 
+@pytest.mark.slow
 def test_a_seed_that_diverged_is_told_of_and_not_run_again(here, tell, point: str, tmp_path: Path):
     out = tmp_path / "run"
 
