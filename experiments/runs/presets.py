@@ -94,8 +94,8 @@ are the first 3 episodes of 49 steps; batch 32 is ours, as the paper is silent o
 NCHAIN_LAPTOP = dataclasses.replace(
     NCHAIN_PAPER,
     dynamics=dataclasses.replace(NCHAIN_PAPER.dynamics, hidden=(64, 64)),
-    generator=GeneratorConfig(activation="tanh"),
-    svgd=dataclasses.replace(NCHAIN_PAPER.svgd, temperature=0.3),
+    generator=dataclasses.replace(LAPTOP.generator, num_generators=5, bootstrap="none"),
+    svgd=dataclasses.replace(NCHAIN_PAPER.svgd, batches="own"),
     ddqn=dataclasses.replace(NCHAIN_PAPER.ddqn, lr=1e-3),
     fit=dataclasses.replace(NCHAIN_PAPER.fit, lr=1e-3, epochs=0, steps=10),
     mcts=MCTSConfig(num_iterations=100, num_trajectories=300),

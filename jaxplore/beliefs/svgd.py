@@ -48,6 +48,10 @@ MIN_BANDWIDTH = 1e-6
 """Floor of the bandwidth: identical particles must not divide by zero."""
 
 
+NUM_JUDGES = 64
+"""Draws of z, always the same, on which it is judged whether a feature depends on z."""
+
+
 @dataclass(frozen=True)
 class SVGDConfig:
     """The choices that make up one posterior approximation. The defaults are what the paper prints."""
@@ -438,7 +442,9 @@ def _step(spec: SVGDSpec, state: SVGDState, z: Array, gradient: Params, residual
         "gradient_norm": optax.tree.norm(gradient),
     }
     if generator.features is not None:
-        metrics["dead_features"] = dead_share(generator.features(state.eta, z))
+        # Not on `z`, of which there may be one or two.
+        judges = generator.sample_noise(jax.random.key(0), NUM_JUDGES)
+        metrics["dead_features"] = dead_share(generator.features(state.eta, judges))
     eta = optax.apply_updates(state.eta, steps)
     return SVGDState(eta=eta, opt_state=opt_state, likelihood_var=likelihood_var, z=z), metrics
 

@@ -10,6 +10,7 @@ from tests.experiments.tiny import rows
 TINY_CHAIN = (
     *("--env=nchain", "--preset=smoke", "--steps=12", "--warm-up-steps=8", "--checkpoint-every=6"),
     *("--dynamics.hidden", "4", "--generator.hidden", "4", "--generator.noise-size=2", "--svgd.num-particles=2"),
+    "--generator.num-generators=2",
     *("--mcts.num-iterations=4", "--mcts.num-trajectories=2", "--mcts.horizon=5"),
 )
 

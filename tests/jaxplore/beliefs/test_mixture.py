@@ -53,6 +53,22 @@ def test_each_is_updated_on_a_batch_of_its_own_as_if_alone(data):
     assert 0.0 <= float(metrics["dead_features"]) <= 1.0
 
 
+@pytest.mark.parametrize(("activation", "dead"), [("tanh", 0.0), ("relu", 1.0)])
+def test_a_feature_is_judged_on_draws_of_its_own_where_a_step_has_one_of_each(data, activation: str, dead: float):
+    generator = dataclasses.replace(GENERATOR, activation=activation)
+    belief = make_generator_belief(OBS, ACTION, NETWORK, generator, SVGDConfig(num_particles=K, batches="own"), FIT)
+    state = jax.jit(belief.init)(jax.random.key(0))
+    # Far below zero, where ReLU is 0 whatever z is, and tanh nearly but not quite one number.
+    low = jax.tree_util.tree_map_with_path(
+        lambda path, leaf: leaf - 2.0 if "features" in str(path) and "bias" in str(path) else leaf, state.eta
+    )
+    _, metrics = jax.jit(belief.update)(jax.random.key(1), state.replace(eta=low), *data)
+    _, started = jax.jit(belief.update)(jax.random.key(1), state, *data)
+    assert float(started["dead_features"]) < 0.2
+    assert float(metrics["dead_features"]) <= dead
+    assert (float(metrics["dead_features"]) > 0.0) == (dead > 0.0)
+
+
 def test_networks_are_as_many_from_each():
     belief, alone = make(), make(dataclasses.replace(GENERATOR, num_generators=1), M // K)
     state, key = jax.jit(belief.init)(jax.random.key(0)), jax.random.key(1)
