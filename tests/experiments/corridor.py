@@ -51,5 +51,5 @@ ONWARDS = Method(
     sac_in_imagination,
     actions="continuous",
 )
-"""An explorer that never sees the task's reward and is never done with the corridor. One that seeks disagreement comes to
-such an end, too, but moves on when it knows it."""
+"""An explorer that never sees the task's reward and is never done with the corridor. One that seeks disagreement comes
+to such an end, too, but moves on when it knows it."""
