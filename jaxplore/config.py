@@ -14,6 +14,7 @@ from jaxplore.beliefs.svgd import SVGDConfig
 from jaxplore.dynamics import DynamicsConfig
 from jaxplore.learners.ddpg import DDPGConfig
 from jaxplore.learners.ddqn import DDQNConfig
+from jaxplore.learners.maxinfo import InformationConfig
 from jaxplore.learners.ppo import PPOConfig
 from jaxplore.learners.sac import SACConfig
 from jaxplore.signals.distillation import RNDConfig
@@ -79,7 +80,10 @@ class ExplorationConfig:
     """Double DQN, on the task's reward or, where actions are discrete, in place of `sac`."""
     ddpg: DDPGConfig = field(default_factory=DDPGConfig)
     task_sac: SACConfig = TASK_SAC
-    """SAC on the task's reward. `sac_v2` learns `alpha` and leaves the reward as it is."""
+    """SAC on the task's reward. `sac_v2`, `maxinfo` and `maxinfo_implicit` learn `alpha` and leave the reward as it
+    is."""
+    information: InformationConfig = field(default_factory=InformationConfig)
+    """What is sought beside the task's reward."""
 
     def __post_init__(self) -> None:
         checks = Checks(self)

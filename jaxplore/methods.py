@@ -21,6 +21,8 @@ from jaxplore.parts import (
     fields_read,
     gaussian_belief,
     generator_belief,
+    information_reward,
+    informed_sac,
     lasting_sac_on_real_data,
     model_free_ddpg,
     model_free_ddqn,
@@ -95,6 +97,25 @@ def as_sac_v2(config: ExplorationConfig) -> ExplorationConfig:
     """SAC's second form: a learned entropy weight, and the reward as it is."""
     return dataclasses.replace(
         config, task_sac=dataclasses.replace(config.task_sac, learn_alpha=True, reward_scale=1.0)
+    )
+
+
+def as_informed(config: ExplorationConfig) -> ExplorationConfig:
+    """`as_sac_v2`, and a belief that goes on from round to round with a gradient step for each of SAC's updates."""
+    steps = config.model_free.updates_per_round
+    return dataclasses.replace(
+        as_sac_v2(config), fit=dataclasses.replace(config.fit, epochs=0, steps=steps, restart=False)
+    )
+
+
+def as_maxinfo(config: ExplorationConfig) -> ExplorationConfig:
+    """Sukhija et al.'s code: five networks of 2 x 256 with swish, Adam at 3e-4 on batches of 256, nothing clipped."""
+    config = as_informed(config)
+    return dataclasses.replace(
+        config,
+        dynamics=dataclasses.replace(config.dynamics, hidden=(256, 256), activation="swish"),
+        ensemble=dataclasses.replace(config.ensemble, num_members=5),
+        fit=dataclasses.replace(config.fit, lr=3e-4, weight_decay=0.0, batch_size=256, clip_value=0.0, clip_norm=0.0),
     )
 
 
@@ -266,6 +287,22 @@ METHODS: dict[str, Method] = {
         needs_reward=True,
         actions="continuous",
         settings=as_explorer,
+    ),
+    "maxinfo": Method(
+        "static networks, SAC on the environment's own reward and on what its actions would tell (MaxInfoSAC)",
+        read_off(static_belief, information_reward),
+        informed_sac,
+        needs_reward=True,
+        actions="continuous",
+        settings=as_maxinfo,
+    ),
+    "maxinfo_implicit": Method(
+        "generator of models, SAC on the environment's own reward and on what its actions would tell",
+        read_off(generator_belief, information_reward),
+        informed_sac,
+        needs_reward=True,
+        actions="continuous",
+        settings=as_informed,
     ),
     "random": Method("uniform random actions", task_reward, uniform_actions),
 }

@@ -12,7 +12,7 @@ from jaxplore.behaviours.base import Behaviour
 from jaxplore.behaviours.gradient import make_gradient_policy
 from jaxplore.behaviours.imagination import make_imagination
 from jaxplore.behaviours.on_policy import make_on_policy
-from jaxplore.behaviours.real_data import make_model_free, make_reactive
+from jaxplore.behaviours.real_data import ModelFreeConfig, make_informed, make_model_free, make_reactive
 from jaxplore.behaviours.tree_search import make_tree_search
 from jaxplore.behaviours.uniform import make_uniform
 from jaxplore.beliefs.base import Belief
@@ -23,6 +23,7 @@ from jaxplore.dynamics import Normalizers, Prediction
 from jaxplore.learners.base import Learner
 from jaxplore.learners.ddpg import make_ddpg
 from jaxplore.learners.ddqn import make_ddqn
+from jaxplore.learners.maxinfo import Gain, make_maxinfo_sac
 from jaxplore.learners.sac import make_sac
 from jaxplore.signals import rewards
 from jaxplore.signals.base import Reward, Signal, make_belief_signal
@@ -135,6 +136,16 @@ def error_reward(config: ExplorationConfig) -> Reward:
 def spread_reward(config: ExplorationConfig) -> Reward:
     """How far apart the actors' changes are."""
     return Reward(lambda prediction, delta, normalizers: rewards.trajectory_spread(delta), "normalised delta")
+
+
+@reads("information", "dynamics")
+def information_reward(config: ExplorationConfig) -> Reward:
+    """How much more than noise the models disagree."""
+    if config.dynamics.target == "one_hot":
+        problem = "is probabilities, which have no noise to compare a spread with"
+        raise FieldError("target", "one_hot", "'delta'", problem, "DynamicsConfig")
+    std = config.information.noise_std
+    return Reward(lambda prediction, delta, normalizers: rewards.information_gain(prediction, std), "nats")
 
 
 MakeBelief: TypeAlias = Callable[[Sizes, ExplorationConfig], Belief]
@@ -268,12 +279,15 @@ def uniform_actions(sizes: Sizes, config: ExplorationConfig, signal: Signal) -> 
     return make_uniform(sizes.action, sizes.discrete)
 
 
+def _model_free_config(sizes: Sizes, config: ExplorationConfig) -> ModelFreeConfig:
+    """One-hot observations stay as they are."""
+    normalize_obs = config.model_free.normalize_obs and not sizes.one_hot_obs
+    return dataclasses.replace(config.model_free, normalize_obs=normalize_obs)
+
+
 def _model_free(learner: Learner, sizes: Sizes, config: ExplorationConfig, signal: Signal) -> Behaviour:
-    """A learner that lasts, on real transitions. One-hot observations stay as they are."""
-    model_free = dataclasses.replace(
-        config.model_free, normalize_obs=config.model_free.normalize_obs and not sizes.one_hot_obs
-    )
-    return make_model_free(learner, sizes.obs, sizes.action, model_free, signal)
+    """A learner that lasts, on real transitions."""
+    return make_model_free(learner, sizes.obs, sizes.action, _model_free_config(sizes, config), signal)
 
 
 @reads("model_free", "ddqn")
@@ -292,3 +306,13 @@ def model_free_ddpg(sizes: Sizes, config: ExplorationConfig, signal: Signal) -> 
 def model_free_sac(sizes: Sizes, config: ExplorationConfig, signal: Signal) -> Behaviour:
     """SAC that lasts, with the settings for a task's reward, on real transitions."""
     return _model_free(make_sac(sizes.obs, sizes.action, config.task_sac), sizes, config, signal)
+
+
+@reads("model_free", "task_sac", "information")
+def informed_sac(sizes: Sizes, config: ExplorationConfig, signal: Signal) -> Behaviour:
+    """The same, whose policy also seeks what the signal says of its actions."""
+
+    def make(gain: Gain) -> Learner:
+        return make_maxinfo_sac(sizes.obs, sizes.action, gain, config.task_sac, config.information)
+
+    return make_informed(signal, make, sizes.obs, sizes.action, _model_free_config(sizes, config))

@@ -4,6 +4,7 @@ All randomness follows from the seed, the purpose and the step, so a run that is
 interrupted.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -146,8 +147,11 @@ def learn_round(
     rows: tuple[Transition, Array],
     obs: Array,
     num_data: Array,
+    alive: Array,
 ) -> tuple[ExplorerState, Metrics, dict[str, Array]]:
-    """One seed's round: assess its transitions and their validity (`rows`), take them in, improve."""
+    """One seed's round: assess its transitions and their validity (`rows`), take them in, improve. If it does not come
+    out finite, or is not alive, it keeps the state that it had.
+    """
     assess_key, improve_key = jax.random.split(key)
     seen = explorer.assess(assess_key, state, *rows)
     after, metrics = explorer.improve(improve_key, explorer.observe(state, *rows), obs, num_data)
@@ -155,7 +159,16 @@ def learn_round(
     parts = {name: getattr(after, name) for name in ("belief", "signal", "behaviour", "normalizers")}
     finite = {name: jnp.isfinite(value) for name, value in metrics.items()}
     finite |= {f"the state of the {name}": all_finite(part) for name, part in parts.items()}
-    return after, {**seen, **metrics}, finite
+    good = jnp.all(jnp.stack(list(finite.values()))) & alive
+    # Of the replay only how far it reaches: to choose between its rows would be to copy all of them in each round, and
+    # what it does not hold nobody reads. It holds all steps of a run, so that none was written over.
+    chosen = jax.tree.map(lambda new, old: jnp.where(good, new, old), _without_rows(after), _without_rows(state))
+    data = dataclasses.replace(chosen.data, rows=after.data.rows)
+    return dataclasses.replace(chosen, data=data), {**seen, **metrics}, finite
+
+
+def _without_rows(state: ExplorerState) -> ExplorerState:
+    return dataclasses.replace(state, data=dataclasses.replace(state.data, rows=None))
 
 
 def learn_side_by_side(
@@ -167,21 +180,16 @@ def learn_side_by_side(
     num_data: Array,
     alive: Array,
 ) -> tuple[ExplorerState, Metrics, dict[str, Array]]:
-    """`learn_round` of each seed. One that does not come out finite, or is not alive, keeps the state that it had."""
+    """`learn_round` of each seed."""
     learn = functools.partial(learn_round, explorer)
     if alive.shape[0] == 1:
         # Not under `vmap`: with an axis more, if only of 1, XLA on CPUs turns matrices that could lie as they are.
-        own_key, own_state, own_rows, own_obs = jax.tree.map(lambda leaf: leaf[0], (keys, state, rows, obs))
-        only = learn(own_key, own_state, own_rows, own_obs, num_data)
-        after, metrics, finite = jax.tree.map(lambda leaf: leaf[None], only)
-    else:
-        after, metrics, finite = jax.vmap(learn, in_axes=(0, 0, 0, 0, None))(keys, state, rows, obs, num_data)
-    good = jnp.all(jnp.stack(list(finite.values())), axis=0) & alive
-
-    def choose(new: Array, old: Array) -> Array:
-        return jnp.where(good.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
-
-    return jax.tree.map(choose, after, state), metrics, finite
+        own_key, own_state, own_rows, own_obs, own_alive = jax.tree.map(
+            lambda leaf: leaf[0], (keys, state, rows, obs, alive)
+        )
+        only = learn(own_key, own_state, own_rows, own_obs, num_data, own_alive)
+        return jax.tree.map(lambda leaf: leaf[None], only)
+    return jax.vmap(learn, in_axes=(0, 0, 0, 0, None, 0))(keys, state, rows, obs, num_data, alive)
 
 
 def mark_cells(cells: Coverage, visited: Array, obs: Array, valid: Array) -> Array:

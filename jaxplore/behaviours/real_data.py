@@ -1,6 +1,7 @@
 """Behaviour on real transitions alone, with the reward that a signal gives them now, or with the task's own."""
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -8,10 +9,11 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxplore import replay, validate
+from jaxplore import normalizer, replay, validate
 from jaxplore.behaviours.base import (
     Behaviour,
     Experience,
+    check_imaginable,
     label,
     lesson_of,
     make_act,
@@ -21,6 +23,7 @@ from jaxplore.behaviours.base import (
     train,
 )
 from jaxplore.learners.base import Learner
+from jaxplore.learners.maxinfo import Gain
 from jaxplore.signals.base import Signal
 from jaxplore.signals.task import TASK
 from jaxplore.types import Array, Key, Metrics
@@ -217,3 +220,56 @@ def make_model_free(
     reactive = ReactiveConfig(config.updates_per_round, act_greedily=config.act_greedily)
     options = {"lasting": True, "normalize_obs": config.normalize_obs}
     return make_reactive(signal, learner, obs_size, action_size, reactive, **options)
+
+
+def make_informed(
+    signal: Signal,
+    make_learner: Callable[[Gain], Learner],
+    obs_size: int,
+    action_size: int,
+    config: ModelFreeConfig | None = None,
+) -> Behaviour:
+    """Train a learner that lives as long as the run on the environment's own reward, and on what a signal says of the
+    actions that its policy would take now.
+
+    The signal is not added to the rewards of what happened: it is asked anew, by the round's models, at each update.
+
+    Args:
+        signal: how interesting a transition is, differentiable in the action, by what its belief's models predict or
+            where that leads.
+        make_learner: a learner with such a gain, such as `make_maxinfo_sac`. It carries the same whatever the gain.
+        obs_size: `O`.
+        action_size: `A`.
+        config: how much of everything. `normalize_obs` is done as it says, whatever the observations are.
+
+    Returns:
+        A `Behaviour`. The metrics are the learner's, from the last update.
+
+    Raises:
+        ValueError: a size below 1; the signal cannot be imagined.
+
+    Example:
+        >>> import functools, jax, jax.numpy as jnp
+        >>> from jaxplore import beliefs, dynamics, learners, rewards, signals
+        >>> belief = beliefs.make_ensemble_belief(2, 1, 5, dynamics_config=dynamics.DynamicsConfig(hidden=(8,)))
+        >>> told = signals.Reward(lambda prediction, delta, normalizers: rewards.information_gain(prediction), "nats")
+        >>> make = functools.partial(learners.make_maxinfo_sac, 2, 1, config=learners.SACConfig(hidden=(8,)))
+        >>> behaviour = make_informed(signals.make_belief_signal(belief, told), make, 2, 1)
+        >>> actor = behaviour.actor(jax.jit(behaviour.init)(jax.random.key(0)))
+        >>> behaviour.act(jax.random.key(1), actor, dynamics.init_normalizers(2, 1), jnp.zeros((5, 2))).shape
+        (5, 1)
+    """
+    check_imaginable(signal)
+    config = config or ModelFreeConfig()
+
+    def improve(key: Key, state: Any, experience: Experience) -> tuple[Any, Metrics]:
+        def gain(seen: Array, action: Array) -> Array:
+            normalizers = experience.normalizers
+            obs = normalizer.denormalize(normalizers.obs, seen) if config.normalize_obs else seen
+            return signal.expect(experience.models, experience.own, normalizers, obs, action)
+
+        now = make_model_free(make_learner(gain), obs_size, action_size, config)
+        return now.improve(key, state, experience)
+
+    at_rest = make_learner(lambda seen, action: jnp.zeros(seen.shape[0]))
+    return make_model_free(at_rest, obs_size, action_size, config)._replace(improve=improve)

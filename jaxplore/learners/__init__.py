@@ -3,6 +3,7 @@
 from jaxplore.learners.base import Learner
 from jaxplore.learners.ddpg import DDPGConfig, make_ddpg
 from jaxplore.learners.ddqn import DDQNConfig, make_ddqn
+from jaxplore.learners.maxinfo import InformationConfig, make_maxinfo_sac
 from jaxplore.learners.ppo import PPO, PPOConfig, make_ppo
 from jaxplore.learners.sac import SACConfig, make_sac
 
@@ -10,11 +11,13 @@ __all__ = [
     "PPO",
     "DDPGConfig",
     "DDQNConfig",
+    "InformationConfig",
     "Learner",
     "PPOConfig",
     "SACConfig",
     "make_ddpg",
     "make_ddqn",
+    "make_maxinfo_sac",
     "make_ppo",
     "make_sac",
 ]

@@ -21,6 +21,7 @@ from jaxplore.networks import (
     INITIALIZERS,
     LOG_STD_MAPS,
     MLP,
+    GaussianParams,
     TanhGaussianPolicy,
     apply,
     sample_tanh_gaussian,
@@ -178,35 +179,59 @@ def noise(networks: SACNetworks, key: Key, num: int | None = None) -> Array:
     return jax.random.normal(key, (num or networks.config.batch_size, networks.action_size))
 
 
+class Drawn(NamedTuple):
+    """Actions drawn from a policy."""
+
+    gaussian: GaussianParams
+    """What they were drawn from, before the squash, `[B, A]`."""
+    action: Array
+    """`[B, A]`"""
+    log_prob: Array
+    """`[B]`"""
+
+
+def draw(networks: SACNetworks, policy: Params, noise: Array, obs: Array) -> Drawn:
+    """What standard normal noise `[B, A]` makes of the policy with these parameters at `obs [B, O]`."""
+    gaussian = apply(networks.policy, policy, obs)
+    return Drawn(gaussian, *tanh_gaussian_of(noise, gaussian))
+
+
 def loss(
-    networks: SACNetworks, params: Params, noise: Array, target_v: Params, batch: Transition
+    networks: SACNetworks,
+    params: Params,
+    drawn: Drawn,
+    target_v: Params,
+    batch: Transition,
+    bonus: Array | None = None,
 ) -> tuple[Array, Metrics]:
     """Sum of the losses of all networks (Haarnoja et al. 2018, equations 5, 7 and 12), whose gradients do not mix.
 
     Args:
         networks: the fixed parts.
         params: `SACState.params`.
-        noise: of the policy's actions, standard normal, `[B, A]`.
+        drawn: actions of the policy in `params` at the batch's observations.
         target_v: parameters of the slow value network.
         batch: `[B, ...]`.
+        bonus: what those actions are worth beside reward and entropy, `[B]`; the policy climbs its gradient. None:
+            nothing.
 
     Returns:
         `(loss, metrics)`, scalars.
     """
     config = networks.config
     alpha = jnp.exp(jax.lax.stop_gradient(params["log_alpha"])) if config.learn_alpha else config.alpha
-    gaussian = apply(networks.policy, params["policy"], batch.obs)
-    action, log_prob = tanh_gaussian_of(noise, gaussian)
+    gaussian, action, log_prob = drawn
+    price = alpha * log_prob if bonus is None else alpha * log_prob - bonus
     # The networks share no parameters, so the gradient of the sum is each network's own.
     q_of_policy = jnp.min(action_values(networks, jax.lax.stop_gradient(params["q"]), batch.obs, action), axis=0)
     penalty = jnp.mean(tanh_mean(gaussian) ** 2) + jnp.mean(gaussian.log_std**2)
-    policy_loss = jnp.mean(alpha * log_prob - q_of_policy) + config.policy_penalty * penalty
+    policy_loss = jnp.mean(price - q_of_policy) + config.policy_penalty * penalty
 
     next_v = state_value(networks, target_v, batch.next_obs)
     q_target = config.reward_scale * batch.reward + config.discount * jnp.where(batch.terminated, 0.0, next_v)
     q = action_values(networks, params["q"], batch.obs, batch.action)
     q_loss = 0.5 * jnp.sum(jnp.mean((q - jax.lax.stop_gradient(q_target)[None]) ** 2, axis=1))
-    v_target = jax.lax.stop_gradient(q_of_policy - alpha * log_prob)
+    v_target = jax.lax.stop_gradient(q_of_policy - price)
     v_loss = 0.5 * jnp.mean((state_value(networks, params["v"], batch.obs) - v_target) ** 2)
     metrics = {
         "q_loss": q_loss,
@@ -229,12 +254,23 @@ def update(networks: SACNetworks, key: Key, state: SACState, batch: Transition) 
 
 def update_given(networks: SACNetworks, noise: Array, state: SACState, batch: Transition) -> tuple[SACState, Metrics]:
     """The same with its noise `[B, A]`; see `Learner.update_given`."""
-    gradient, metrics = jax.grad(partial(loss, networks), has_aux=True)(state.params, noise, state.target_v, batch)
+
+    def objective(params: Params) -> tuple[Array, Metrics]:
+        return loss(networks, params, draw(networks, params["policy"], noise, batch.obs), state.target_v, batch)
+
+    gradient, metrics = jax.grad(objective, has_aux=True)(state.params)
+    after, moved = step(networks, state, gradient)
+    return after, {**metrics, **moved}
+
+
+def step(networks: SACNetworks, state: SACState, gradient: Params) -> tuple[SACState, Metrics]:
+    """The state one step down the gradient of its parameters, the slow network after it; with `learn_alpha` the metric
+    is `alpha`.
+    """
     steps, opt_state = networks.optimizer.update(gradient, state.opt_state, state.params)
     params: Params = optax.apply_updates(state.params, steps)
     target_v = optax.incremental_update(params["v"], state.target_v, networks.config.tau)
-    if networks.config.learn_alpha:
-        metrics = {**metrics, "alpha": jnp.exp(params["log_alpha"])}
+    metrics = {"alpha": jnp.exp(params["log_alpha"])} if networks.config.learn_alpha else {}
     return SACState(params, target_v, opt_state), metrics
 
 

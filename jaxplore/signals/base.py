@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
+import jax.numpy as jnp
+
 from jaxplore.beliefs.base import Belief, make_no_belief
 from jaxplore.dynamics import Normalizers, Prediction
 from jaxplore.replay import Replay
@@ -79,6 +81,18 @@ class Signal(NamedTuple):
         """What real transitions `[N, ...]` are worth, `[N]`, by models drawn from the belief."""
         assert self.score is not None
         return self.score(own, self.see(models, normalizers, transitions))
+
+    def expect(self, models: Any, own: Any, normalizers: Normalizers, obs: Array, action: Array) -> Array:
+        """What it would be worth, `[N]`, to take `action [N, A]` at `obs [N, O]`, raw units, if that led to where
+        models drawn from the belief expect on average. Differentiable in the action.
+        """
+        assert self.score is not None
+        prediction = self.belief.imagine(models, normalizers, obs, action)
+        expected = jnp.mean(prediction.mean, axis=0)
+        next_obs = self.belief.encoding.next_obs(normalizers, obs, expected)
+        reward, flag = jnp.zeros(obs.shape[0]), jnp.zeros(obs.shape[0], bool)
+        rows = Transition(obs, action, reward, next_obs, flag, flag)
+        return self.score(own, Seen(rows, prediction, expected, normalizers))
 
 
 def make_belief_signal(belief: Belief, reward: Reward) -> Signal:

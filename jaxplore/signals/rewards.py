@@ -141,6 +141,39 @@ def jensen_shannon(prediction: Prediction) -> Array:
     return mixture - jnp.mean(entropy, axis=0)
 
 
+def information_gain(prediction: Prediction, noise_std: float = 1e-3) -> Array:
+    """How much more than noise the models disagree: `sum_o log(1 + V_o / s_o^2)` (Sukhija et al. 2024).
+
+    `V_o` is the population variance of the models' means and `s_o^2` that of the noise. If the true change were a
+    Gaussian of variance V, independent in each entry, half of this would be what observing it in that noise tells.
+
+    Args:
+        prediction: of m models, `[M, N, O]`. Where they state variances, the noise is their mean.
+        noise_std: standard deviation of the noise, per entry in units of the prediction, where models state none; no
+            stated noise counts as less. Sukhija et al.'s code: 1e-3.
+
+    Returns:
+        `[N]`, nats, at least 0.
+
+    Raises:
+        FieldError: a prediction of another shape, or no noise at all.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> apart = Prediction(jnp.array([[[0.0, 1.0]], [[2.0, 1.0]]]))  # variances 1 and 0
+        >>> round(float(information_gain(apart, noise_std=1.0)[0]), 4)  # ln 2
+        0.6931
+    """
+    _check(prediction)
+    if validate.known(noise_std):
+        validate.in_range("noise_std", float(noise_std), 0.0, open_low=True)
+    spread = jnp.var(prediction.mean, axis=0)
+    noise = noise_std**2
+    if prediction.var is not None:
+        noise = jnp.maximum(jnp.mean(prediction.var, axis=0), noise)
+    return jnp.sum(jnp.log1p(spread / noise), axis=-1)
+
+
 def prediction_error(prediction: Prediction, delta: Array, scale: Array | None = None) -> Array:
     """How far the models' mean is from what happened: `sum_o (mean_i f_io - delta_o)^2`.
 

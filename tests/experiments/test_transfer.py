@@ -16,6 +16,8 @@ from experiments.runs.directory import RunDirectory
 from experiments.runs.spec import RunRef
 from experiments.runs.status import Status
 from experiments.training import build, loop, parent
+from jaxplore.methods import METHODS
+from tests.experiments.corridor import ONWARDS, make_corridor
 from tests.experiments.test_methods_run import make_task_point
 from tests.experiments.tiny import leaves, rows, tiny_flags
 
@@ -265,3 +267,32 @@ def test_a_run_is_given_a_replay_that_holds_all_its_steps():
     assert capacity() == capacity("--steps=9000") == 10_001
     assert capacity("--steps=20000") == 20_001
     assert capacity("--steps=20000", "--data-capacity=20000") == 20_000
+
+
+PARENT = ("--env=corridor", "--method=onwards", "--preset=smoke", "--num-seeds=3", "--steps=500", "--warm-up-steps=100")
+PARENT = (
+    *PARENT,
+    "--sac.alpha=0.002",
+    "--fit.steps=60",
+    "--imagination.updates-per-rollout=100",
+    "--imagination.restart-every=0",
+)
+CHILD = ("--env=corridor", "--method=sac", "--preset=smoke", "--num-seeds=3", "--steps=300", "--warm-up-steps=200")
+CHILD = (*CHILD, "--task-sac.alpha=0.02", "--eval-every=300", "--eval-episodes=2")
+
+
+def test_exploration_finds_the_only_reward_and_sac_alone_does_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    # three seeds: who starts from the policy that walked on meets the reward at the far end in its warm-up and keeps it
+    # when it learns; who starts from nothing has met none by then, and cannot know of any
+    monkeypatch.setitem(envs.FACTORIES, "corridor", make_corridor)
+    monkeypatch.setitem(METHODS, "onwards", ONWARDS)
+    explored, child, alone = (tmp_path / name for name in ("explored", "child", "alone"))
+    assert run.main([*PARENT, f"--out={explored}"]) == 0
+    assert run.main([*CHILD, f"--parent={explored}", "--warm-up=policy", f"--out={child}"]) == 0
+    assert run.main([*CHILD, f"--out={alone}"]) == 0
+    for seed in range(3):
+        mine, others = ([row for row in rows(out) if row["seed"] == seed] for out in (child, alone))
+        returns, none = ([row["episode_return"] for row in of if "episode_return" in row] for of in (mine, others))
+        assert len(returns) == len(none) == 6
+        assert min(returns[:4]) > 5 and mine[-1]["eval/return"] > 5
+        assert none == [0.0] * 6 and others[-1]["eval/return"] == 0

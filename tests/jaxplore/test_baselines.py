@@ -157,6 +157,25 @@ def test_settings_are_those_of_maxs_commands():
     assert METHODS["max"].settings(chain) == chain
 
 
+def test_settings_are_those_of_maxinforls_code():
+    # five networks of 2 x 256 with swish, a step of 3e-4 on 256 transitions for each of SAC's updates, both of whose
+    # weights start at 1 and are learned; the generator's own form is the shared one
+    default = ExplorationConfig()
+    config = METHODS["maxinfo"].settings(default)
+    assert (config.dynamics.hidden, config.dynamics.activation) == ((256, 256), "swish")
+    assert config.ensemble.num_members == 5
+    fit = config.fit
+    assert (fit.lr, fit.weight_decay, fit.batch_size, fit.clip_value, fit.clip_norm) == (3e-4, 0.0, 256, 0.0, 0.0)
+    assert (config.information.weight, config.information.learn_weight, config.information.noise_std) == (1, True, 1e-3)
+    implicit = METHODS["maxinfo_implicit"].settings(default)
+    for name in ("dynamics", "generator", "svgd"):
+        assert getattr(implicit, name) == getattr(default, name)
+    for one in (config, implicit):
+        assert (one.fit.epochs, one.fit.steps, one.fit.restart) == (0, one.model_free.updates_per_round, False)
+        assert one.task_sac == METHODS["sac_v2"].settings(default).task_sac
+        assert (one.task_sac.alpha, one.task_sac.learn_alpha, one.task_sac.lr) == (1.0, True, 3e-4)
+
+
 def test_rewards_of_the_table():
     # each row's reward of the same prediction, against the function that it stands for, in the units of the settings
     means = np.random.default_rng(0).normal(size=(M, 5, O)).astype(np.float32)

@@ -191,3 +191,32 @@ def test_trajectory_spread_is_over_actors():
 def test_refusals(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_information_gain_by_hand():
+    # models (0, 1) and (2, 1): variances 1 and 0. Noise of 0.5: log(1 + 1 / 0.25) + log 1 = log 5. Models that state
+    # variances of 0.1 and 0.3: log(1 + 1 / 0.2), and never less noise than the floor
+    mean = jnp.array([[[0.0, 1.0]], [[2.0, 1.0]]])
+    stated = jnp.array([[[0.1, 0.1]], [[0.3, 0.3]]])
+    gain = jax.jit(rewards.information_gain)
+    for prediction, noise, want in (
+        (Prediction(mean), 0.5, np.log(5.0)),
+        (Prediction(mean, stated), 0.1, np.log(6.0)),
+        (Prediction(mean, stated), 1.0, np.log(2.0)),
+    ):
+        np.testing.assert_allclose(gain(prediction, noise), [want], rtol=1e-6)
+
+
+def test_information_gain_is_numpys_and_small_spreads_are_not_lost():
+    # two loops in float64; with spreads of 1e-4 of the noise it is their ratio squared, which 1 + x alone would round
+    want = [sum(np.log(1 + MEANS[:, n, o].astype(float).var() / 0.3**2) for o in range(3)) for n in range(5)]
+    np.testing.assert_allclose(rewards.information_gain(Prediction(MEANS), 0.3), want, rtol=1e-5)
+    small = rewards.information_gain(Prediction(1e-4 * MEANS), 1.0)
+    np.testing.assert_allclose(small, 1e-8 * np.asarray(variance(Prediction(MEANS))), rtol=1e-4)
+
+
+def test_information_gain_refuses_no_noise():
+    with pytest.raises(ValueError, match=r"noise_std=0\.0 .*\(0, inf"):
+        rewards.information_gain(Prediction(MEANS), 0.0)
+    with pytest.raises(ValueError, match=r"prediction\.mean"):
+        rewards.information_gain(Prediction(MEANS[0]))

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from jaxplore import dynamics, replay, rewards
-from jaxplore.behaviours import Experience, ImaginationConfig, ReactiveConfig, make_imagination, make_reactive
+from jaxplore.behaviours import (
+    Experience,
+    ImaginationConfig,
+    ModelFreeConfig,
+    ReactiveConfig,
+    make_imagination,
+    make_informed,
+    make_reactive,
+)
 from jaxplore.behaviours.gradient import GradientPolicyConfig, make_gradient_policy
 from jaxplore.beliefs import FitConfig, make_no_belief
 from jaxplore.config import ExplorationConfig, Sizes
@@ -20,6 +28,7 @@ from jaxplore.parts import (
     distillation,
     distillation_beside,
     generator_belief,
+    informed_sac,
     model_free_ddpg,
     ppo_on_own_steps,
     read_off,
@@ -207,7 +216,9 @@ def test_any_two_that_fit_make_a_row(signal, behaviour):
     assert ("intrinsic_reward" in told) == (explorer.reward_unit is not None) == (signal is not task_reward)
 
 
-@pytest.mark.parametrize("behaviour", [sac_in_imagination, reward_gradient, METHODS["implicit"].behaviour])
+@pytest.mark.parametrize(
+    "behaviour", [sac_in_imagination, reward_gradient, informed_sac, METHODS["implicit"].behaviour]
+)
 def test_what_cannot_be_imagined_is_refused_by_what_imagines(behaviour):
     # why, and what fits
     fits = r"\. Allowed: a signal with a belief that predicts, or a behaviour on real transitions\."
@@ -217,6 +228,43 @@ def test_what_cannot_be_imagined_is_refused_by_what_imagines(behaviour):
     ):
         with pytest.raises(ValueError, match=why + fits):
             make_explorer(Method("mine", signal, behaviour), Sizes(OBS, ACTION), SMALL)
+
+
+@pytest.mark.parametrize(
+    ("normalize_obs", "reward", "worth"), [(True, VARIANCE, 1.0), (False, VARIANCE, 1.0), (True, ERROR, 0.0)]
+)
+def test_an_informed_learner_has_the_tasks_reward_and_what_the_signal_says_of_any_action(
+    experience, normalize_obs, reward, worth
+):
+    # rewards are the environment's, the transitions' numbers; the gain of actions that nobody took, as the round's
+    # models have it, is the variance |normalised obs|^2, and an error is none where they are right on average
+    experience, _ = experience
+
+    def make(gain):
+        def update(key, state, batch):
+            action = jnp.tanh(jax.random.normal(key, batch.action.shape))
+            return (batch, gain(batch.obs, action)), {"one": jnp.ones(())}
+
+        first = recorder()
+        return first._replace(init=lambda key: (first.init(key), jnp.zeros(BATCH)), update=update)
+
+    config = ModelFreeConfig(updates_per_round=2, normalize_obs=normalize_obs)
+    behaviour = make_informed(make_belief_signal(BELIEF, reward), make, OBS, ACTION, config)
+    state = behaviour.init(jax.random.key(0))
+    (batch, gained), _ = jax.jit(behaviour.improve)(jax.random.key(1), state, experience)
+    rows, stats = jax.device_get((experience.data.rows, experience.normalizers.obs))
+    place = np.asarray(batch.reward, int)
+    normalised = (rows.obs[place] - stats.mean) / np.asarray(stats.std)
+    np.testing.assert_allclose(batch.obs, normalised if normalize_obs else rows.obs[place], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(gained, worth * np.sum(normalised**2, axis=1), rtol=1e-4, atol=1e-5)
+    assert len(set(place)) > 4
+
+
+def test_the_information_of_probabilities_is_refused():
+    config = dataclasses.replace(SMALL, dynamics=DynamicsConfig(hidden=(8,), target="one_hot"))
+    sizes = Sizes(OBS, ACTION, one_hot_obs=True, has_reward=True)
+    with pytest.raises(ValueError, match=r"DynamicsConfig\.target='one_hot' is probabilities.*Allowed: 'delta'"):
+        make_explorer(METHODS["maxinfo"], sizes, config)
 
 
 def test_other_pairs_that_do_not_fit_are_refused():
