@@ -64,7 +64,7 @@ SMOKE = dataclasses.replace(
     LAPTOP,
     dynamics=DynamicsConfig(hidden=(32, 32)),
     generator=dataclasses.replace(LAPTOP.generator, hidden=(8, 4), num_generators=2),
-    fit=dataclasses.replace(LAPTOP.fit, steps=10),
+    fit=dataclasses.replace(LAPTOP.fit, lr=1e-3, steps=10),
     imagination=dataclasses.replace(
         LAPTOP.imagination, horizon=10, num_actors=32, num_rollouts=1, updates_per_rollout=20, real_fraction=0.5
     ),

@@ -58,7 +58,7 @@ def test_a_run_writes_its_metrics(finished):
         assert ("intrinsic_reward" in row) == ("model_error" in row) == ("fit/loss" in row) == (row["step"] >= 31)
     assert [row["cells"] for row in told] == sorted(row["cells"] for row in told)
     assert told[0]["cells"] >= 1
-    assert {"fit/loss", "fit/variance", "policy/q_loss", "policy/imagined_reward"} <= told[-1].keys()
+    assert {"fit/loss", "fit/dead_features", "policy/q_loss", "policy/imagined_reward"} <= told[-1].keys()
     assert all(np.isfinite(value) for row in told for value in row.values())
     times = [json.loads(line) for line in (finished.out / "metrics.jsonl").read_text().splitlines()]
     assert all(row["wall_time"] > 0 and row["steps_per_second"] > 0 for row in times)
@@ -141,9 +141,9 @@ def test_two_seeds_are_two_runs(finished, tell, tmp_path: Path):
             ]
             assert row.keys() == twin.keys()
             # Each round magnifies the rounding of those before it, by how much hangs on the CPU: one seed and two are
-            # two programs.
-            rel = {75: 2e-1, 81: 3e-1}.get(row["step"], 2e-3)
-            for name in row:
+            # two programs. By the last nothing that is learned can be compared.
+            rel = 2e-1 if row["step"] == 75 else 2e-3
+            for name in ("cells", "dropped") if row["step"] == STEPS[-1] else row:
                 assert twin[name] == pytest.approx(row[name], rel=rel, abs=1e-4), (name, row["step"])
     assert rows(finished.out)[-1]["intrinsic_reward"] != rows(one.out)[-1]["intrinsic_reward"]
     assert "seeds 0 to 1" in both.stdout
@@ -300,10 +300,10 @@ def test_preset_and_configuration_must_agree(tmp_path: Path, capsys: pytest.Capt
 
 
 def test_a_method_brings_its_own_settings_and_flags_come_on_top(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    # nnaisense/max's TVAX has alpha 0.2 and swish where all others share 0.02 and ReLU; a file that names a method has
+    # nnaisense/max's TVAX has alpha 0.2 and swish where all others share 0.05 and ReLU; a file that names a method has
     # settled them, one that names none has not
     shared, config = parse("--preset=smoke"), parse("--preset=smoke", "--method=max_trajectory")
-    assert (shared.explorer.sac.alpha, shared.explorer.dynamics.activation) == (0.02, "relu")
+    assert (shared.explorer.sac.alpha, shared.explorer.dynamics.activation) == (0.05, "relu")
     assert (config.explorer.sac.alpha, config.explorer.dynamics.activation) == (0.2, "swish")
     assert parse("--preset=smoke", "--method", "max_trajectory", "--sac.alpha=0.5").explorer.sac.alpha == 0.5
     path = tmp_path / "c.json"

@@ -276,6 +276,8 @@ PARENT = (
     "--fit.steps=60",
     "--imagination.updates-per-rollout=100",
     "--imagination.restart-every=0",
+    "--imagination.real-fraction=0",
+    "--imagination.keep-imagined",
 )
 CHILD = ("--env=corridor", "--method=sac", "--preset=smoke", "--num-seeds=3", "--steps=300", "--warm-up-steps=200")
 CHILD = (*CHILD, "--task-sac.alpha=0.02", "--eval-every=300", "--eval-episodes=2")
