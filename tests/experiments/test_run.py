@@ -142,7 +142,7 @@ def test_two_seeds_are_two_runs(finished, tell, tmp_path: Path):
             assert row.keys() == twin.keys()
             # Each round magnifies the rounding of those before it, by how much hangs on the CPU: one seed and two are
             # two programs. By the last nothing that is learned can be compared.
-            rel = 2e-1 if row["step"] == 75 else 2e-3
+            rel = 5e-1 if row["step"] == 75 else 2e-3
             for name in ("cells", "dropped") if row["step"] == STEPS[-1] else row:
                 assert twin[name] == pytest.approx(row[name], rel=rel, abs=1e-4), (name, row["step"])
     assert rows(finished.out)[-1]["intrinsic_reward"] != rows(one.out)[-1]["intrinsic_reward"]
