@@ -283,6 +283,7 @@ CHILD = ("--env=corridor", "--method=sac", "--preset=smoke", "--num-seeds=3", "-
 CHILD = (*CHILD, "--task-sac.alpha=0.02", "--eval-every=300", "--eval-episodes=2")
 
 
+@pytest.mark.slow
 def test_exploration_finds_the_only_reward_and_sac_alone_does_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     # three seeds: who starts from the policy that walked on meets the reward at the far end in its warm-up and keeps it
     # when it learns; who starts from nothing has met none by then, and cannot know of any
