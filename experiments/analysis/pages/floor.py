@@ -48,6 +48,12 @@ def histogram(panel: FloorVisits) -> Histogram:
     return Histogram(counts, by_seed, left, bottom, side)
 
 
+def measure(panel: FloorVisits, cells: Histogram) -> str:
+    """What the picture shows, with its units."""
+    seeds = len(np.unique(np.asarray(panel.seeds)))
+    return f"visits of a square of {cells.side:.2g} m, seeds together: {seeds}; x, y in metres"
+
+
 def limits(counts: np.ndarray) -> list[int]:
     """The fewest visits of each shade: equal factors from 1 to the most; fewer shades where few differ."""
     most = int(counts.max()) if counts.size else 0

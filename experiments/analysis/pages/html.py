@@ -9,7 +9,7 @@ import numpy as np
 from experiments.analysis.pages import curves, floor, look, svg
 from experiments.analysis.pages.contents import FloorVisits, Panel, Report, Section, Table, panel_names, slug
 from experiments.analysis.pages.markdown import MARKS
-from experiments.analysis.pages.numbers import finite, steps_scale, summary, thin, values_scale
+from experiments.analysis.pages.numbers import finite, steps_scale, thin, values_scale
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 """The browser is told that the page loads nothing."""
@@ -89,7 +89,7 @@ def _curves(panel: Panel, name: str, file: str) -> str:
     """A panel of curves: pictures, legend, numbers."""
     x, y = steps_scale(panel), values_scale(panel)
     thinned = [thin(one) for one in panel.series]
-    lines = [svg.Line(i, one.label, one.steps, summary(one.values)) for i, one in enumerate(thinned)]
+    lines = svg.lines_of(thinned)
     many = len(lines) > svg.MOST_IN_PICTURE
     frame = svg.SMALL if many else svg.WHOLE
     if many:
@@ -147,11 +147,10 @@ def _floor(panel: FloorVisits, name: str, file: str) -> str:
         for number, low in enumerate(levels, 1)
         for shade in (floor.shade_of(number, len(levels)),)
     )
-    seeds = len(np.unique(np.asarray(panel.seeds)))
     return "\n".join(
         (
             f'<figure class="floor" aria-labelledby="{name}-h"><h3 id="{name}-h">{escape(panel.title)}</h3>',
-            f'<p class="measure">visits of a square of {cells.side:.2g} m, seeds together: {seeds}; x, y in metres</p>',
+            f'<p class="measure">{floor.measure(panel, cells)}</p>',
             _plot(floor.draw(panel, name, cells)),
             f'<ul class="legend"><li>visits, from:</li>{shades}</ul>',
             f'<p class="tools">{_files(file)}</p><p class="said" aria-live="polite"></p>',

@@ -3,11 +3,9 @@
 import math
 from html import escape
 
-import numpy as np
-
 from experiments.analysis.pages import floor, look, svg
 from experiments.analysis.pages.contents import FloorVisits, Panel
-from experiments.analysis.pages.numbers import short, steps_scale, summary, thin, values_scale
+from experiments.analysis.pages.numbers import short, steps_scale, thin, values_scale
 
 ROW = 14
 """Height of a line of text."""
@@ -25,8 +23,7 @@ def text(panel: Panel | FloorVisits) -> str:
 
 def _curves(panel: Panel) -> str:
     x, y = steps_scale(panel), values_scale(panel)
-    thinned = [thin(one) for one in panel.series]
-    lines = [svg.Line(i, one.label, one.steps, summary(one.values)) for i, one in enumerate(thinned)]
+    lines = svg.lines_of([thin(one) for one in panel.series])
     if len(lines) <= svg.MOST_IN_PICTURE:
         frame = svg.WHOLE
         drawn = svg.draw(panel, lines, "p", "", frame, x, y, panel.title)
@@ -56,9 +53,7 @@ def _visits(panel: FloorVisits) -> str:
         parts.append(f'<path class="v{floor.shade_of(number, len(levels))}" d="M{left:g} {at + 2:g}h10v10h-10z"/>')
         parts.append(_text(left + 14, at + 11, said))
         left += 26 + LETTER * len(said)
-    seeds = len(np.unique(np.asarray(panel.seeds)))
-    said = f"visits of a square of {cells.side:.2g} m, seeds together: {seeds}; x, y in metres"
-    return _file(width, height + 2 * ROW + 4, said, parts)
+    return _file(width, height + 2 * ROW + 4, floor.measure(panel, cells), parts)
 
 
 def _file(width: float, height: float, said: str, parts: list[str]) -> str:

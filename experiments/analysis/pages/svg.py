@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.analysis.pages.contents import Panel
-from experiments.analysis.pages.numbers import Scale, Summary, short, step_name, ticks
+from experiments.analysis.pages.contents import Panel, Series
+from experiments.analysis.pages.numbers import Scale, Summary, short, step_name, summary, ticks
 
 COLOURS = 7
 """The page's `--c0` to `--c6`; further series have them again, dashed."""
@@ -39,6 +39,11 @@ class Line(NamedTuple):
     label: str
     steps: np.ndarray
     summary: Summary
+
+
+def lines_of(series: list[Series]) -> list[Line]:
+    """Each series with its mean and spread over seeds, in their order."""
+    return [Line(i, one.label, one.steps, summary(one.values)) for i, one in enumerate(series)]
 
 
 def letter(index: int) -> str:
