@@ -129,23 +129,26 @@ def test_flags_come_on_top_of_a_configuration(tmp_path: Path):
     assert (config.explorer.sac.lr, config.explorer.sac.alpha) == (0.125, 0.25)
 
 
-def test_two_seeds_are_two_runs(finished, tell, tmp_path: Path):
-    one = tell(tmp_path / "one", "--seed=1", *TINY)
-    both = tell(tmp_path / "both", "--num-seeds=2", *TINY)
-    assert (one.status, both.status) == (0, 0)
+def test_two_seeds_are_two_runs(tell, tmp_path: Path):
+    # policies on imagined transitions, which magnify rounding less than real ones do
+    words = (*TINY, "--imagination.real-fraction=0", "--imagination.keep-imagined")
+    zero = tell(tmp_path / "zero", *words)
+    one = tell(tmp_path / "one", "--seed=1", *words)
+    both = tell(tmp_path / "both", "--num-seeds=2", *words)
+    assert (zero.status, one.status, both.status) == (0, 0, 0)
     assert [(row["step"], row["seed"]) for row in rows(both.out)] == [(step, seed) for step in STEPS for seed in (0, 1)]
-    for alone in (finished, one):
+    for alone in (zero, one):
         for row in rows(alone.out):
             (twin,) = [
                 other for other in rows(both.out) if (other["step"], other["seed"]) == (row["step"], row["seed"])
             ]
             assert row.keys() == twin.keys()
             # Each round magnifies the rounding of those before it, by how much hangs on the CPU: one seed and two are
-            # two programs. By the last nothing that is learned can be compared.
-            rel = 5e-1 if row["step"] == 75 else 2e-3
-            for name in ("cells", "dropped") if row["step"] == STEPS[-1] else row:
+            # two programs.
+            rel = {75: 2e-1, 81: 3e-1}.get(row["step"], 2e-3)
+            for name in row:
                 assert twin[name] == pytest.approx(row[name], rel=rel, abs=1e-4), (name, row["step"])
-    assert rows(finished.out)[-1]["intrinsic_reward"] != rows(one.out)[-1]["intrinsic_reward"]
+    assert rows(zero.out)[-1]["intrinsic_reward"] != rows(one.out)[-1]["intrinsic_reward"]
     assert "seeds 0 to 1" in both.stdout
     assert re.search(r"^ *range  ", both.stdout, re.M)
 
