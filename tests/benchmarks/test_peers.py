@@ -2,13 +2,14 @@
 
 import dataclasses
 import sys
+import types
 
 import jax
 import numpy as np
 import pytest
 
 from benchmarks import flops, peers, run
-from benchmarks.peers import common, ensemble, sac, search, vector
+from benchmarks.peers import common, ensemble, returns, sac, search, vector
 from benchmarks.peers.common import Line
 from benchmarks.timing import Pairs, measure_pairs
 from experiments.runs.presets import preset_config
@@ -219,3 +220,33 @@ def test_flops_of_the_second_form_against_what_xla_counts_of_sbx(monkeypatch):
 def test_the_table_of_peers():
     text = common.table([Line("step", "tiny", "PyTorch", Pairs(1.0, 0.5, 0.5, 0.45, 12.4), 2 * 10**9, 10**9)])
     assert " ".join(text.splitlines()[2].split()) == "step tiny PyTorch 1 s 500 ms 0.50 0.45 to 12 2 G 1 G"
+
+
+class Constant:
+    """A library's SAC that learns nothing and always does the same."""
+
+    def __init__(self, policy, env, **settings):
+        self.action, self.settings, self.num_timesteps = np.zeros(env.action_space.shape, np.float32), settings, 0
+
+    def learn(self, steps, reset_num_timesteps):
+        assert not reset_num_timesteps
+        self.num_timesteps += steps
+
+    def predict(self, obs, deterministic):
+        assert deterministic
+        return self.action, None
+
+
+def test_a_whole_run_of_a_peer_is_evaluated_as_ours_are(monkeypatch, tmp_path):
+    package = types.SimpleNamespace(SAC=Constant, __version__="1.0")
+    monkeypatch.setitem(sys.modules, "sbx", package)
+    monkeypatch.setattr(returns, "torch_on_one_thread", lambda: None)
+    out = tmp_path / "run.json"
+    flags = ["--steps=25", "--eval-every=10", "--eval-episodes=2", "--warm-up-steps=7", f"--out={out}"]
+    monkeypatch.setattr(sys, "argv", ["returns", "--library=sbx", *flags])
+    returns.main()
+    stored = run.json.loads(out.read_text())
+    assert [row["env_steps"] for row in stored["rows"]] == [10, 20, 25] and stored["warm_up_steps"] == 7
+    # A cheetah that does nothing stays where it is, but for how it lands.
+    assert all(abs(row["return"]) < 50 for row in stored["rows"])
+    assert stored["rows"][0]["return_std"] > 0
