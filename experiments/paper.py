@@ -204,7 +204,7 @@ def _carry_out(
                 _write(made, now, failed, rates, asked.every)
 
     with _served(made.out, port, board) if watched else contextlib.nullcontext():
-        found = conduct.carry_out(made, standings, executor, tell)
+        found = conduct.carry_out(made, standings, executor, tell, board.again)
     board.clear()
     written = _write(made, found.standings, found.failed, rates)
     print(f"\n{_summary(written, made)}", flush=True)

@@ -36,6 +36,10 @@ class Board(Screen):
         self._last = float("-inf")
         self._first = True
 
+    def again(self, key: str, why: str) -> None:
+        """Says that a job's worker was lost, and that the job is not."""
+        self.say(f"{self._plan.jobs[key].name}: {why.rstrip('.')}; it goes on from its latest checkpoint")
+
     def update(
         self, standings: Mapping[str, Standing], working: Sequence[str], failed: Mapping[str, str], waiting: int
     ) -> None:

@@ -40,8 +40,17 @@ class Outcome(NamedTuple):
 Tell = Callable[[Mapping[str, Standing], Sequence[str], Mapping[str, str], int], Any]
 """`(standings, keys of those at work, those that failed and why, seconds since the start)`."""
 
+Again = Callable[[str, str], Any]
+"""`(key, why it ended from outside)` of a job that is about to be started again."""
 
-def carry_out(plan_: Plan, standings: Mapping[str, Standing], executor: Executor, tell: Tell) -> Outcome:
+
+def carry_out(
+    plan_: Plan,
+    standings: Mapping[str, Standing],
+    executor: Executor,
+    tell: Tell,
+    again: Again = lambda key, why: None,
+) -> Outcome:
     """Carry out what is not finished.
 
     A job that ends from outside (its worker was killed, its machine went away) is started again and resumes from its
@@ -55,6 +64,7 @@ def carry_out(plan_: Plan, standings: Mapping[str, Standing], executor: Executor
         standings: where each job stands.
         executor: who does it.
         tell: called time and again.
+        again: called for each job that its worker lost.
 
     Raises:
         RunError: a directory cannot be read any more.
@@ -93,10 +103,12 @@ def carry_out(plan_: Plan, standings: Mapping[str, Standing], executor: Executor
                 if why is None:
                     if now[key].state is not State.FINISHED:
                         tries[key] = 1 if now[key].step > before.step else tries.get(key, 0) + 1
+                        outside = end.error or "it ended from outside"
                         if tries[key] < TRIES:
                             waiting.insert(0, key)
+                            again(key, outside)
                         else:
-                            failed[key] = end.error or "it ended from outside, time and again"
+                            failed[key] = outside
                     continue
                 failed[key] = why
         tell(now, [], failed, 0)

@@ -53,3 +53,12 @@ def test_plain_lines_elsewhere(made: plan.Plan):
     for _ in range(3):
         shown.update(now, list(made.jobs)[:2], {}, 1)
     assert stream.getvalue() == "0 of 3 runs done, 2 at work\n"
+
+
+def test_a_worker_that_was_lost_is_said(made: plan.Plan):
+    stream = io.StringIO()
+    shown = board.Board(made, {}, 2, stream=stream, live=False)
+    first = next(iter(made.jobs))
+    shown.again(first, "its Slurm job 7 went away (cancelled).")
+    said = f"{made.jobs[first].name}: its Slurm job 7 went away (cancelled); it goes on from its latest checkpoint\n"
+    assert stream.getvalue() == said

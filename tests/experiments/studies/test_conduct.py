@@ -49,8 +49,8 @@ def name_of(job: Job) -> str:
     return job.name.rpartition("-")[0].removeprefix("half_cheetah_task-").removeprefix("ant_maze-")
 
 
-def carry_out(made: plan.Plan, script: Script, tell=lambda *_: None) -> conduct.Outcome:
-    return conduct.carry_out(made, plan.look_all(made), script.executor, tell)
+def carry_out(made: plan.Plan, script: Script, tell=lambda *_: None, again=lambda *_: None) -> conduct.Outcome:
+    return conduct.carry_out(made, plan.look_all(made), script.executor, tell, again)
 
 
 def test_parents_first_so_many_at_a_time_and_what_is_finished_stays(tmp_path: Path):
@@ -69,11 +69,15 @@ def test_parents_first_so_many_at_a_time_and_what_is_finished_stays(tmp_path: Pa
 def test_one_that_was_killed_is_started_again_and_one_that_failed_is_not(tmp_path: Path):
     made = plan.make([figure("a", (cell("random", seeds=3),))], "laptop", tmp_path)
     script = Script({"random-seed0": [KILLED, KILLED], "random-seed1": [WRONG], "random-seed2": [KILLED] * 9})
-    outcome = carry_out(made, script)
+    told = []
+    outcome = carry_out(made, script, again=lambda key, why: told.append((name_of(made.jobs[key]), why)))
     counts = {name: len(list(all_of)) for name, all_of in itertools.groupby(sorted(script.started))}
     assert counts == {"random-seed0": 3, "random-seed1": 1, "random-seed2": conduct.TRIES}
     failed = {name_of(made.jobs[key]): why for key, why in outcome.failed.items()}
     assert failed == {"random-seed1": "the disk is full", "random-seed2": "it was ended by SIGKILL"}
+    # What is given up is told as failed, not as going on.
+    again = [(f"random-seed{seed}", KILLED.error) for seed in (0, 2)]
+    assert sorted(told) == sorted(again * 2)
 
 
 def test_one_that_gets_on_between_kills_is_started_as_often_as_it_takes(
