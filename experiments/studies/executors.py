@@ -94,6 +94,9 @@ def work(task: Work) -> End:
 def slurm(folder: Path, memory: int, variables: Mapping[str, str], cluster: str | None = None) -> Executor:
     """Jobs of Slurm, by `submitit`, as many as the cluster takes.
 
+    Tried with Slurm 22.05 and its accounting, which submitit asks whether a job is still there: jobs cancelled by
+    `scancel`, and jobs whose processes were killed, were submitted again and went on.
+
     Args:
         folder: where submitit writes; all machines must see it, and the runs.
         memory: bytes of a job.
@@ -120,8 +123,8 @@ def slurm(folder: Path, memory: int, variables: Mapping[str, str], cluster: str 
             return None
         try:
             return submitted.result()
-        except Exception as error:  # submitit's own, one for each way in which a job can go away.
-            return End(LOST, f"its Slurm job {submitted.job_id} went away ({_line(error)})")
+        except Exception:  # submitit's own, one for each way in which a job can go away.
+            return End(LOST, f"its Slurm job {submitted.job_id} went away ({submitted.state})")
 
     def stop(jobs: Sequence[Any]) -> None:
         for one in jobs:

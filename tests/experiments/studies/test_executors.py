@@ -1,6 +1,7 @@
 """Workers that are killed: the run resumes elsewhere, and comes out as one that nobody touched."""
 
 import os
+import shutil
 import signal
 import time
 from pathlib import Path
@@ -114,6 +115,15 @@ def test_a_submitit_job(tmp_path: Path):
     # The local cluster's watcher starts again what ends by SIGTERM; SIGKILL is what it cannot see.
     executor = executors.slurm(tmp_path / "workers", MEMORY, {}, cluster="local")
     carry_out(tmp_path / "out", executor, lambda pid: (kill(parent_of(pid)), None)[1])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("sbatch") is None, reason="there is no Slurm")
+def test_a_slurm_job(tmp_path: Path):
+    """Where this machine is itself a node, and `sacct` works."""
+    pytest.importorskip("submitit")
+    executor = executors.slurm(tmp_path / "workers", MEMORY, {})
+    carry_out(tmp_path / "out", executor, lambda pid: kill(parent_of(pid)))
 
 
 @pytest.mark.slow
