@@ -43,6 +43,7 @@ def test_it_is_short():
     assert len(README.splitlines()) <= 200
 
 
+@pytest.mark.slow
 def test_an_environment_of_your_own_takes_30_lines_and_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(envs, "FACTORIES", dict(envs.FACTORIES))

@@ -141,6 +141,7 @@ def test_asking_again_gives_the_same(asked: Path):
     assert (asked / "calibration.json").read_text() == before
 
 
+@pytest.mark.slow
 def test_an_earlier_checkpoint_can_be_asked(asked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     out = tmp_path / "run"
     shutil.copytree(asked, out)
@@ -190,6 +191,7 @@ def test_an_environment_that_cannot_be_put_anywhere_is_asked_less():
     assert calibrate.num_steps(make_point()) == 600
 
 
+@pytest.mark.slow
 def test_a_bar_on_a_terminal(asked: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     shutil.copytree(asked, tmp_path / "run")
     stream = io.StringIO()
@@ -201,6 +203,7 @@ def test_a_bar_on_a_terminal(asked: Path, tmp_path: Path, monkeypatch: pytest.Mo
     assert stream.getvalue().split("\r")[-1].strip() == ""
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_ctrl_c_gives_a_line(finished, tmp_path: Path):
     runs = [tmp_path / str(i) for i in range(5)]

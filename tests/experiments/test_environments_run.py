@@ -10,12 +10,9 @@ from tests.experiments.tiny import STEPS, TINY, rows
 
 ELSEWHERE = {"ant_maze", "nchain"}
 """In the other tests here."""
-QUICK = {"half_cheetah", "hand_block"}
-"""Compiling the rest again shows little: acrobot and mountain car run in other tests too."""
-NAMES = [
-    pytest.param(name, marks=[] if name in QUICK else [pytest.mark.slow])
-    for name in sorted(set(envs.FACTORIES) - ELSEWHERE)
-]
+NAMES = [pytest.param(name, marks=pytest.mark.slow) for name in sorted(set(envs.FACTORIES) - ELSEWHERE)]
+"""Each compiles its own programs, half a minute and more; that the environments are what they should be is tested where
+they are."""
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -116,6 +116,7 @@ def test_no_task_no_evaluation(words: tuple[str, ...], tmp_path: Path, capsys: p
 # Runs from a parent.
 
 
+@pytest.mark.slow
 def test_a_run_starts_from_its_parents_policy(evaluated: Path, task: None, tmp_path: Path):
     out = tmp_path / "child"
     words = [*SAC, f"--parent={evaluated}@75", "--seed=7", f"--out={out}"]

@@ -36,7 +36,7 @@ def out(ended: Path, tmp_path: Path, point: str) -> Path:
     return tmp_path / "run"
 
 
-@pytest.mark.parametrize("steps", [120, 100])
+@pytest.mark.parametrize("steps", [pytest.param(120, marks=pytest.mark.slow), 100])
 def test_a_run_made_longer_is_the_run_that_was_as_long_from_the_start(steps: int, out: Path, tell, tmp_path: Path):
     # 81 is not where a longer run's rounds end: it continues from 75
     told = tell(out, "--resume", f"--steps={steps}")
@@ -161,6 +161,7 @@ def test_the_older_checkpoint_is_offered_where_the_rows_reach_it(out: Path, tell
     assert [json.loads(line)["step"] for line in path.read_text().splitlines()] == list(tiny.STEPS)
 
 
+@pytest.mark.slow
 def test_a_longer_run_has_a_larger_replay_with_the_data_that_it_had(point: str, tell, tmp_path: Path):
     # 90 are kept of 81 steps; 120 need room for more, which is what a run of 120 had from the start
     words = [*RANDOM, "--data-capacity=90"]

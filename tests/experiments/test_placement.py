@@ -63,6 +63,7 @@ def check(found, count):
     assert found["from another seed"] > 0.1
 
 
+@pytest.mark.slow
 def test_eight_seeds_on_eight_devices_are_those_on_one_and_wait_for_none_another():
     module, words = "tests.experiments.on_many_devices", ("implicit belief", 8)
     check(devices.result(devices.start(module, *words, num_devices=8)), 8)

@@ -49,6 +49,7 @@ def test_sigterm_says_how_to_go_on(tmp_path: Path):
     assert "Traceback" not in stderr
 
 
+@pytest.mark.slow
 def test_a_closed_console_does_not_end_a_run(tmp_path: Path):
     # as when a terminal is closed: both streams broken, and SIGHUP
     out = tmp_path / "run"

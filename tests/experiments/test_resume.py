@@ -125,6 +125,7 @@ def test_killed_before_the_first_checkpoint_a_run_starts_over(tell, point: str, 
     assert_same_run(whole, out)
 
 
+@pytest.mark.slow
 def test_kill_9_while_saving_the_ant(tell, finished, tmp_path: Path):
     """A real kill, of the real command, in the middle of a save."""
     out = tmp_path / "run"
@@ -171,7 +172,7 @@ def test_mjx_resumes_to_the_bit(tell, tmp_path: Path):
     assert_same_run(whole.out, out)
 
 
-@pytest.mark.parametrize("env", ["ant_maze", "point"])
+@pytest.mark.parametrize("env", [pytest.param("ant_maze", marks=pytest.mark.slow), "point"])
 def test_each_program_is_traced_once(
     env: str, tell, point: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, finished
 ):

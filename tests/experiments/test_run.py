@@ -129,6 +129,7 @@ def test_flags_come_on_top_of_a_configuration(tmp_path: Path):
     assert (config.explorer.sac.lr, config.explorer.sac.alpha) == (0.125, 0.25)
 
 
+@pytest.mark.slow
 def test_two_seeds_are_two_runs(tell, tmp_path: Path):
     # policies on imagined transitions, which magnify rounding less than real ones do
     words = (*TINY, "--imagination.real-fraction=0", "--imagination.keep-imagined")

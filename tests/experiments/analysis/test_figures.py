@@ -189,8 +189,9 @@ def test_unwritable_pictures_are_named(tmp_path: Path):
         plot_coverage(tmp_path / "file" / "c.png", [Curves("implicit", STEPS, seeds(1))], COVERAGE)
 
 
-@pytest.mark.parametrize("count", [1, 2, 4, 5, 8, 9, 25])
-@pytest.mark.parametrize("reachable", [None, 2])
+@pytest.mark.parametrize(
+    ("count", "reachable"), [(1, 2), (2, None), (4, None), (5, 2), (8, None), (8, 2), (9, None), (25, 2)]
+)
 def test_no_legend_covers_a_curve(tmp_path: Path, figures: list[Figure], count: int, reachable: int | None):
     # Curves that leave no corner free.
     values = np.stack([np.linspace(0, 1, len(STEPS)), np.linspace(1, 0, len(STEPS))])

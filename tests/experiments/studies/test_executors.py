@@ -72,6 +72,7 @@ def kill(pid: int) -> None:
     os.kill(pid, signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_a_local_process(tmp_path: Path):
     carry_out(tmp_path, executors.local(1, {}), kill)
 
