@@ -166,7 +166,7 @@ def test_watching_serves_the_page_while_the_plan_runs(small: str, tmp_path: Path
     seen, out = [], tmp_path / "out"
     made = plan.make([figures_of_paper.figures()[small]], "smoke", out)
 
-    def carry_out(plan_, standings, executor, tell):
+    def carry_out(plan_, standings, executor, tell, again):
         for job in made.jobs.values():
             by_hand.finish(job)
             tell(plan.look_all(made), [], {}, 0)
