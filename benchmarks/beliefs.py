@@ -52,6 +52,8 @@ class Kind(NamedTuple):
     """Geometric mean over transitions of error over variance: 1 where the size of the uncertainty is right."""
     rank: float
     """Spearman's correlation of variance and error."""
+    within: float | None = None
+    """Variance among the networks of one generator, where there are several; unbiased."""
 
 
 class Verdict(NamedTuple):
@@ -113,17 +115,21 @@ def judge(belief: Belief, models: Any, normalizers: dynamics.Normalizers, rows: 
     """What models make of transitions `[N, ...]`."""
 
     @jax.jit
-    def some(models: Any, rows: Transition) -> tuple[Any, Any]:
+    def some(models: Any, rows: Transition) -> tuple[Any, Any, Any]:
         prediction, target = belief.judge(models, normalizers, rows)
-        return rewards.variance(prediction), rewards.prediction_error(prediction, target)
+        variance = rewards.variance(prediction)
+        within = rewards.variance_within(prediction, belief.num_groups) if grouped else jnp.zeros_like(variance)
+        return variance, rewards.prediction_error(prediction, target), within
 
+    grouped = 1 < belief.num_groups < belief.num_models
     num = len(rows.obs)
     places = (np.arange(-(-num // CHUNK) * CHUNK) % num).reshape(-1, CHUNK)
     parts = [jax.device_get(some(models, jax.tree.map(lambda leaf, at=at: leaf[at], rows))) for at in places]
-    variance, error = (np.concatenate(column)[:num] for column in zip(*parts, strict=True))
+    variance, error, within = (np.concatenate(column)[:num] for column in zip(*parts, strict=True))
     ratio = float(np.exp(np.mean(np.log(np.maximum(error, 1e-12)) - np.log(np.maximum(variance, 1e-12)))))
     found: Any = stats.spearmanr(variance, error)
-    return Kind(float(error.mean()), float(variance.mean()), ratio, float(found[0]))
+    own = float(within.mean()) if grouped else None
+    return Kind(float(error.mean()), float(variance.mean()), ratio, float(found[0]), own)
 
 
 def verdict(name: str, method: str, config: ExplorationConfig, steps: int, seed: int) -> Verdict:
@@ -143,7 +149,17 @@ def verdict(name: str, method: str, config: ExplorationConfig, steps: int, seed:
 
 def table(verdicts: Sequence[Verdict]) -> str:
     """The verdicts as text: means over fits."""
-    head = ("environment", "transitions", "error", "variance", "error / variance", "rank", "ms a step", "dead features")
+    head = (
+        "environment",
+        "transitions",
+        "error",
+        "variance",
+        "error / variance",
+        "rank",
+        "within",
+        "ms a step",
+        "dead features",
+    )
     lines = []
     for name in dict.fromkeys(one.environment for one in verdicts):
         own = [one for one in verdicts if one.environment == name]
@@ -151,11 +167,13 @@ def table(verdicts: Sequence[Verdict]) -> str:
             found = [one.kinds[kind] for one in own]
             ratio = float(np.exp(np.mean(np.log([one.ratio for one in found]))))
             values = (np.mean([one.error for one in found]), np.mean([one.variance for one in found]), ratio)
+            within = [one.within for one in found if one.within is not None]
             dead = [one.metrics["dead_features"] for one in own if "dead_features" in one.metrics]
             lines.append(
                 (
                     *(name, kind, *(number(float(value)) for value in values)),
                     f"{np.mean([one.rank for one in found]):.2f}",
+                    number(float(np.mean(within))) if within else "-",
                     f"{np.median([one.milliseconds for one in own]):.1f}",
                     f"{np.mean(dead):.0%}" if dead else "-",
                 )

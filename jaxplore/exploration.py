@@ -77,9 +77,10 @@ class Explorer(NamedTuple):
     """`assess(key, state, transitions [T, ...], valid [T]) -> metrics`: what transitions that have not been learned
     from are worth. `intrinsic_reward` in the unit `reward_unit`, of every method that has one. Of every belief, so that
     methods can be compared, also the `variance` of its models (equation 1, in units of normalised delta or
-    probability) and their `divergence` (Jensen-Renyi, of probabilities Jensen-Shannon, in nats); of each the mean, and
-    with `_p95` the 95th percentile. And `model_error`, the mean squared error of the models' mean, per normalised-delta
-    entry, where 1 is as good as predicting the mean change; or per probability."""
+    probability) and their `divergence` (Jensen-Renyi, of probabilities Jensen-Shannon, in nats), and where several
+    generators draw them `variance_within` one of these; of each the mean, and with `_p95` the 95th percentile. And
+    `model_error`, the mean squared error of the models' mean, per normalised-delta entry, where 1 is as good as
+    predicting the mean change; or per probability."""
     adopt: Callable[[ExplorerState, Actor], ExplorerState] | None
     """`adopt(state, actor) -> state`: with the policy of another agent's actor and the statistics that it sees
     observations by, which stay as they are from now on, whatever comes: its weights mean nothing by others. What is
@@ -259,6 +260,8 @@ def assess(agent: Agent, key: Key, state: ExplorerState, transitions: Transition
     if belief.predict is None:
         return _spreads(of_each, counts)
     of_each["variance"] = rewards.variance(seen.prediction)
+    if 1 < belief.num_groups < belief.num_models:
+        of_each["variance_within"] = rewards.variance_within(seen.prediction, belief.num_groups)
     of_each["divergence"] = agent.divergence(seen.prediction, seen.delta, state.normalizers)
     errors = jnp.mean((jnp.mean(seen.prediction.mean, axis=0) - seen.delta) ** 2, axis=-1)
     return {**_spreads(of_each, counts), "model_error": jnp.nanmean(jnp.where(counts, errors, jnp.nan))}

@@ -52,6 +52,12 @@ FIELDS: dict[str, Field] = {
             "model",
             ("variance", "normalised delta or probability, squared", "equation 1 on the round's transitions"),
             ("variance_p95", "normalised delta or probability, squared", "95th percentile of the same"),
+            (
+                "variance_within",
+                "normalised delta or probability, squared",
+                "of `variance`, what is among networks of one of several generators; 0: they are one network",
+            ),
+            ("variance_within_p95", "normalised delta or probability, squared", "95th percentile of the same"),
             ("divergence", "nats", "Jensen-Renyi divergence there (of probabilities Jensen-Shannon)"),
             ("divergence_p95", "nats", "95th percentile of the same"),
             ("model_error", PREDICTION, "squared error of the models' mean on the round's transitions"),

@@ -123,14 +123,24 @@ def diverged_error(directory: RunDirectory, names: list[str], seeds: list[int], 
 
 MANY_DEAD = 0.5
 """Share of the generator's features without effect from which on the console says so."""
+FEW_WITHIN = 0.05
+"""Share of the variance among networks of one generator below which the console says so."""
 
 
 def dying(rows: Sequence[Mapping[str, Any]]) -> str:
     """What to warn of where the generator is dying, so that its networks differ by little; empty where it is not."""
     dead = max((row.get("fit/dead_features", 0.0) for row in rows), default=0.0)
-    if dead < MANY_DEAD:
-        return ""
-    return (
-        f"warning: {dead:.0%} of the generator's features are the same for every z (fit/dead_features), so that its "
-        "networks are nearly one. ReLU's, which the paper has, die; with --generator.activation=tanh none do."
-    )
+    if dead >= MANY_DEAD:
+        return (
+            f"warning: {dead:.0%} of the generator's features are the same for every z (fit/dead_features), so that "
+            "its networks are nearly one. ReLU's, which the paper has, die; with --generator.activation=tanh and "
+            "--svgd.batches=shared none do."
+        )
+    shares = [row["variance_within"] / row["variance"] for row in rows if row.get("variance_within") and row["variance"]]
+    if min(shares, default=1.0) < FEW_WITHIN:
+        return (
+            f"warning: networks of one generator make {min(shares):.1%} of the variance of all (variance_within), so "
+            "that each generator stands for one network. With --svgd.batches=own nothing keeps them apart; with "
+            "--svgd.batches=shared the repulsion of SVGD does."
+        )
+    return ""

@@ -93,6 +93,8 @@ class Belief(NamedTuple):
     """What `inputs` and predictions are."""
     num_models: int = 0
     """m, models drawn for a round."""
+    num_groups: int = 1
+    """K, of equal size, that a draw of models falls into one after the other: those of one generator. 1: all."""
     fit_config: FitConfig | None = None
     """How it is fitted in a round. None: not at all."""
 

@@ -106,6 +106,7 @@ def make_generator_belief(
         predict=functools.partial(predict, parts),
         encoding=encoding,
         num_models=svgd_config.num_particles * count,
+        num_groups=count,
         fit_config=fit_config,
     )
 

@@ -56,6 +56,36 @@ def variance(prediction: Prediction, delta_std: Array | None = None) -> Array:
     return jnp.sum(spread, axis=-1)
 
 
+def variance_within(prediction: Prediction, num_groups: int) -> Array:
+    """How far apart models of one group are: those that one of several generators draws.
+
+    The unbiased variance over the models of a group, summed over observation entries, its mean over groups. Beside
+    `variance` it tells how much of the disagreement is a generator's own: 0 where all its draws are one network.
+
+    Args:
+        prediction: of m models, `[M, N, O]`, those of a group one after the other.
+        num_groups: K, of equal size, at least 2 models each.
+
+    Returns:
+        `[N]`, at least 0, in the prediction's units squared.
+
+    Raises:
+        FieldError: a prediction of another shape, or a number of groups that leaves no pairs.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> models = jnp.array([[[0.0]], [[2.0]], [[5.0]], [[5.0]]])
+        >>> float(variance_within(Prediction(models), 2)[0])
+        1.0
+    """
+    _check(prediction)
+    num = prediction.mean.shape[0]
+    if num_groups < 1 or num % num_groups or num // num_groups < 2:
+        raise FieldError("num_groups", num_groups, f"a divisor of {num} models that leaves 2 or more in each")
+    groups = prediction.mean.reshape(num_groups, num // num_groups, *prediction.mean.shape[1:])
+    return jnp.sum(jnp.mean(jnp.var(groups, axis=1, ddof=1), axis=0), axis=-1)
+
+
 def jensen_renyi(prediction: Prediction, decay: float = 0.1) -> Array:
     """Jensen-Renyi divergence of order 2 between Gaussian predictions (Shyam et al. 2019; nnaisense/max).
 

@@ -615,6 +615,9 @@ def test_a_dying_generator_is_warned_of_once():
     rows = [{"fit/dead_features": 0.2}, {"fit/dead_features": 0.94}]
     assert re.match(r"warning: 94% of .*--generator\.activation=tanh", record.dying(rows))
     assert record.dying(rows[:1]) == record.dying([{}]) == record.dying([]) == ""
+    one = {"variance": 4.0, "variance_within": 0.1}
+    assert re.match(r"warning: .* make 2\.5% of the variance .*--svgd\.batches=shared", record.dying([one]))
+    assert record.dying([one | {"variance_within": 1.0}]) == record.dying([{"variance": 4.0}]) == ""
     said: list[str] = []
     session: Any = loop.Session.__new__(loop.Session)
     session._announced, session.progress = set(), types.SimpleNamespace(say=said.append)

@@ -37,6 +37,7 @@ def data():
 def test_each_is_updated_on_a_batch_of_its_own_as_if_alone(data):
     belief, alone = make(), make(dataclasses.replace(GENERATOR, num_generators=1), M // K)
     assert (belief.num_models, alone.num_models) == (M, M // K)
+    assert (belief.num_groups, alone.num_groups) == (K, 1)
     init_key, key = jax.random.split(jax.random.key(0))
     state = jax.jit(belief.init)(init_key)
     after, metrics = jax.jit(belief.update)(key, state, *data)

@@ -7,6 +7,8 @@ import pytest
 
 from jaxplore.dynamics import Prediction
 from jaxplore.signals import rewards
+from jaxplore.signals.rewards import variance_within
+from jaxplore.validate import FieldError
 
 variance, jensen_renyi, jensen_shannon, prediction_error, trajectory_spread = map(
     jax.jit,
@@ -65,6 +67,26 @@ def test_variance_ignores_stated_variances():
     # equation 1 is about means only
     stated = Prediction(MEANS, np.full_like(MEANS, 9.0))
     np.testing.assert_array_equal(variance(stated), variance(Prediction(MEANS)))
+
+
+def test_variance_within_is_each_groups_own():
+    # two groups of two: unbiased variances by hand, whatever lies between the groups
+    groups = MEANS[:4].astype(float).reshape(2, 2, *MEANS.shape[1:])
+    want = np.mean([group.var(axis=0, ddof=1).sum(axis=-1) for group in groups], axis=0)
+    far = MEANS[:4] + np.array([0, 0, 50, 50], np.float32)[:, None, None]
+    np.testing.assert_allclose(variance_within(Prediction(MEANS[:4]), 2), want, rtol=1e-5)
+    np.testing.assert_allclose(variance_within(Prediction(far), 2), want, rtol=1e-3)
+    # one group: all models, whose unbiased variance is m / (m - 1) times equation 1
+    whole = variance_within(Prediction(MEANS[:4]), 1)
+    np.testing.assert_allclose(whole, variance(Prediction(MEANS[:4])) * 4 / 3, rtol=1e-5)
+
+
+@pytest.mark.parametrize("num", [0, 3, 4])
+def test_groups_without_pairs_are_refused(num):
+    with pytest.raises(
+        FieldError, match=rf"num_groups={num}\. Allowed: a divisor of 4 models that leaves 2 or more in each"
+    ):
+        variance_within(Prediction(MEANS[:4]), num)
 
 
 LOW, HIGH = np.exp(-5.0), np.exp(-1.0)
