@@ -26,10 +26,8 @@ from jaxplore import (
 
 LAPTOP = ExplorationConfig(
     dynamics=DynamicsConfig(hidden=(64, 64)),
-    generator=GeneratorConfig(
-        noise_size=4, hidden=(32, 4), activation="tanh", num_generators=16, bootstrap="poisson", bootstrap_std=0.5
-    ),
-    svgd=SVGDConfig(temperature=0.001, tempering="per_datum", batches="own", accept_improper=True),
+    generator=GeneratorConfig(hidden=(64, 16), activation="tanh", num_generators=4),
+    svgd=SVGDConfig(temperature=0.2, tempering="per_datum"),
     fit=FitConfig(lr=3e-3, weight_decay=0.0, batch_size=128, epochs=0, steps=60, restart=False),
     imagination=ImaginationConfig(
         horizon=25,
@@ -54,16 +52,13 @@ LAPTOP = ExplorationConfig(
     rnd=RNDConfig(hidden=(64, 64), features=64, lr=1e-3),
     ppo=PPOConfig(hidden=(64, 64), rollout_steps=128, epochs=4, minibatch_size=32),
 )
-"""Settings for a laptop without a GPU: many small generators, whose features cannot die and which each see data of
-their own, and a policy that learns from what happened. See `experiments/results/ant_maze_laptop/TUNING.md`."""
-
-WITHOUT_BOOTSTRAP = dataclasses.replace(LAPTOP, generator=dataclasses.replace(LAPTOP.generator, bootstrap="none"))
-"""For physics that leaves nothing to chance, where weights on the data cost the most accuracy."""
+"""Settings for a laptop without a GPU: four generators, whose features cannot die and whose draws SVGD keeps apart, and
+a policy that learns from what happened. See `experiments/results/ant_maze_laptop/TUNING.md`."""
 
 SMOKE = dataclasses.replace(
     LAPTOP,
     dynamics=DynamicsConfig(hidden=(32, 32)),
-    generator=dataclasses.replace(LAPTOP.generator, hidden=(8, 4), num_generators=2),
+    generator=dataclasses.replace(LAPTOP.generator, noise_size=4, hidden=(8, 4), num_generators=2),
     fit=dataclasses.replace(LAPTOP.fit, lr=1e-3, steps=10),
     imagination=dataclasses.replace(
         LAPTOP.imagination, horizon=10, num_actors=32, num_rollouts=1, updates_per_rollout=20, real_fraction=0.5
@@ -94,8 +89,8 @@ are the first 3 episodes of 49 steps; batch 32 is ours, as the paper is silent o
 NCHAIN_LAPTOP = dataclasses.replace(
     NCHAIN_PAPER,
     dynamics=dataclasses.replace(NCHAIN_PAPER.dynamics, hidden=(64, 64)),
-    generator=dataclasses.replace(LAPTOP.generator, num_generators=5, bootstrap="none"),
-    svgd=dataclasses.replace(NCHAIN_PAPER.svgd, batches="own"),
+    generator=GeneratorConfig(activation="tanh"),
+    svgd=dataclasses.replace(NCHAIN_PAPER.svgd, temperature=0.3),
     ddqn=dataclasses.replace(NCHAIN_PAPER.ddqn, lr=1e-3),
     fit=dataclasses.replace(NCHAIN_PAPER.fit, lr=1e-3, epochs=0, steps=10),
     mcts=MCTSConfig(num_iterations=100, num_trajectories=300),
@@ -127,10 +122,10 @@ ENVIRONMENTS: dict[str, dict[str, dict[str, Any]]] = {
     },
     "half_cheetah": {"paper": {"obs_noise": 0.02}},
     # Ten episodes.
-    "mountain_car": {"laptop": {"explorer": WITHOUT_BOOTSTRAP, "steps": 5_000}},
+    "mountain_car": {"laptop": {"steps": 5_000}},
     # The paper's scores are hundreds of steps: with 256 random steps at the start many runs would end among them.
     "acrobot": {
-        "laptop": {"explorer": dataclasses.replace(WITHOUT_BOOTSTRAP, warm_up_steps=50)},
+        "laptop": {"explorer": dataclasses.replace(LAPTOP, warm_up_steps=50)},
         "paper": {"explorer": ExplorationConfig(warm_up_steps=50)},
         "smoke": {"explorer": dataclasses.replace(SMOKE, warm_up_steps=50)},
     },
@@ -142,9 +137,6 @@ ENVIRONMENTS: dict[str, dict[str, dict[str, Any]]] = {
     },
 }
 """Environment -> preset -> the fields in which it departs from the defaults. A new environment adds its own."""
-
-BOOTSTRAPPED_LR = 6e-3
-"""Learning rate of the laptop's generators where they have a bootstrap. Static networks were never tried at it."""
 
 CHOSEN_ALPHA: dict[str, dict[str, float]] = {"laptop": {"disagreement": 0.02, "icm": 0.02, "max": 0.1}}
 """Preset -> method -> SAC's weight of entropy, where one was chosen for it, in the maze, by a search of the same size
@@ -179,8 +171,6 @@ def preset_config(preset: str, env: str = "ant_maze", method: str = "implicit") 
     envs.check_name(env)
     config = RunConfig(env=env, method=method, preset=cast(Preset, preset), **settings(preset, env))
     explorer, row = config.explorer, METHODS[method]
-    if preset == "laptop" and explorer.generator.bootstrap != "none" and "generator" in row.reads(explorer):
-        explorer = dataclasses.replace(explorer, fit=dataclasses.replace(explorer.fit, lr=BOOTSTRAPPED_LR))
     alpha = CHOSEN_ALPHA.get(preset, {}).get(method, explorer.sac.alpha)
     explorer = dataclasses.replace(explorer, sac=dataclasses.replace(explorer.sac, alpha=alpha))
     run: dict[str, Any] = {}

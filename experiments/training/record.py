@@ -136,7 +136,9 @@ def dying(rows: Sequence[Mapping[str, Any]]) -> str:
             "its networks are nearly one. ReLU's, which the paper has, die; with --generator.activation=tanh and "
             "--svgd.batches=shared none do."
         )
-    shares = [row["variance_within"] / row["variance"] for row in rows if row.get("variance_within") and row["variance"]]
+    shares = [
+        row["variance_within"] / row["variance"] for row in rows if row.get("variance_within") and row["variance"]
+    ]
     if min(shares, default=1.0) < FEW_WITHIN:
         return (
             f"warning: networks of one generator make {min(shares):.1%} of the variance of all (variance_within), so "

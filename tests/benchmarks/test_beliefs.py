@@ -117,3 +117,15 @@ def test_tanh_features_live_where_the_papers_die():
         dead[activation] = beliefs.verdict("ant_maze", "implicit", own, beliefs.STEPS, 0).metrics["dead_features"]
     assert dead["tanh"] == 0.0
     assert dead["relu"] > 0.5
+
+
+@pytest.mark.slow
+def test_svgd_keeps_the_draws_of_a_generator_apart():
+    # for as many gradient steps as a run of 5,500 has; fitted each on a batch of its own, draws become one network
+    config, share = preset_config("laptop", "ant_maze").explorer, {}
+    for batches in ("shared", "own"):
+        own = dataclasses.replace(config, svgd=dataclasses.replace(config.svgd, batches=batches))
+        kind = beliefs.verdict("ant_maze", "implicit", own, 12_000, 0).kinds["data"]
+        assert kind.within is not None
+        share[batches] = kind.within / kind.variance
+    assert share["shared"] > 0.2 > 4 * share["own"]
