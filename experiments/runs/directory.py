@@ -44,7 +44,7 @@ CONFIG, VERSIONS, SCENE, OUTCOME = "config.json", "versions.json", "scene.json",
 METRICS, PACKED_METRICS, WALK = "metrics.jsonl", "metrics.jsonl.gz", "walk.npz"
 CHECKPOINTS, TENSORBOARD, WANDB = "checkpoints", "tensorboard", "wandb"
 CALIBRATION, OLD_CALIBRATION = "calibration.json", "posterior.json"
-KEPT = (CONFIG, VERSIONS, SCENE, OUTCOME, CALIBRATION, OLD_CALIBRATION)
+KEPT = (CONFIG, VERSIONS, SCENE, OUTCOME, CALIBRATION, OLD_CALIBRATION, WALK)
 """Files that `RunDirectory.keep` copies as they are, those that there are."""
 
 
@@ -74,17 +74,18 @@ class RunDirectory:
         try:
             found = Status(read_json(self.path / OUTCOME)["status"])
         except FileNotFoundError:
-            # Before there were outcomes and scenes the walk was a run's last file; a kept run has neither.
-            is_old = self._has_walk() and not (self.path / SCENE).exists()
+            # Before there were outcomes and scenes the walk was a run's last file; a run kept then has neither.
+            is_old = self.has_walk() and not (self.path / SCENE).exists()
             last = max((row["step"] for row in self.rows()), default=0) if self.is_kept() or is_old else 0
             found = Status.FINISHED if last >= self.config().steps else Status.PARTIAL
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise self._unreadable(OUTCOME, error, "remove it, and finish with --resume") from error
         # Somebody has removed the walk, perhaps because it was damaged: it is written again by --resume.
-        lacks_walk = found is Status.FINISHED and not self.is_kept() and not self._has_walk()
+        lacks_walk = found is Status.FINISHED and not self.is_kept() and not self.has_walk()
         return Status.PARTIAL if lacks_walk else found
 
-    def _has_walk(self) -> bool:
+    def has_walk(self) -> bool:
+        """Whether where each step began is there: of a run that has ended, unless it was kept before walks were."""
         return (self.path / WALK).is_file()
 
     def is_kept(self) -> bool:
@@ -269,7 +270,9 @@ class RunDirectory:
         return self.path / METRICS
 
     def keep(self, directory: Path) -> None:
-        """Copy what comparisons read, the rows compressed, to a directory of the run's name: some 30 kB.
+        """Copy what comparisons and pictures read, the rows compressed, to a directory of the run's name.
+
+        Some 30 kB, and 8 bytes of walk a step where there is a floor plan.
 
         Raises:
             OSError: it cannot be read or written.

@@ -221,7 +221,7 @@ def runs_in(places: Iterable[Path]) -> Iterator[Path]:
 def look(job: Job, finished: Mapping[str, Path] | None = None) -> Standing:
     """Where a job stands: in its own directory, or finished elsewhere.
 
-    A run that was only kept has neither the walk nor checkpoints, and stands in for none that needs these.
+    A run that was only kept has no checkpoints, and stands in for no parent; nor where a walk is needed that it lacks.
 
     Args:
         job: of a plan.
@@ -246,8 +246,8 @@ def look(job: Job, finished: Mapping[str, Path] | None = None) -> Standing:
         return Standing(State.FINISHED, config.steps, job.path)
     elsewhere = (finished or {}).get(job.key)
     if elsewhere is not None:
-        kept = RunDirectory(elsewhere).is_kept()
-        if not (kept and (job.needs_walk or job.is_parent)):
+        other = RunDirectory(elsewhere)
+        if not (job.is_parent and other.is_kept()) and not (job.needs_walk and not other.has_walk()):
             return Standing(State.FINISHED, config.steps, elsewhere)
     row = last_row(directory.metrics_path)
     step = row["step"] if row else 0

@@ -93,15 +93,18 @@ def test_a_finished_run_elsewhere_counts_if_its_identity_is_the_same(tmp_path: P
     assert found[second.key].state is State.TO_DO
 
 
-def test_what_was_only_kept_stands_in_for_no_parent_and_no_walk(tmp_path: Path):
+@pytest.mark.parametrize("walks", [True, False])
+def test_what_was_only_kept_stands_in_for_no_parent_and_no_walk_that_it_lacks(walks: bool, tmp_path: Path):
     figures = [figure("a", (CHILD,)), figure("b", (cell("max"),)), figure("c", (cell("implicit"),), VISITS)]
     made = plan.make(figures, "laptop", tmp_path / "out")
     for job in made.jobs.values():
         RunDirectory(finish(job, path=tmp_path / "whole" / job.name)).keep(tmp_path / "kept")
+        if not walks:
+            (tmp_path / "kept" / job.name / "walk.npz").unlink()
     shutil.rmtree(tmp_path / "whole")
     found = plan.look_all(made, [tmp_path / "kept"])
     finished = {made.jobs[key].spec.config.method for key, one in found.items() if one.state is State.FINISHED}  # pyright: ignore
-    assert finished == {"sac", "max"}
+    assert finished == ({"sac", "max", "implicit"} if walks else {"sac", "max"})
 
 
 def test_another_run_in_its_place_is_refused(tmp_path: Path):
