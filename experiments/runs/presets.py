@@ -90,7 +90,7 @@ NCHAIN_LAPTOP = dataclasses.replace(
     NCHAIN_PAPER,
     dynamics=dataclasses.replace(NCHAIN_PAPER.dynamics, hidden=(64, 64)),
     generator=GeneratorConfig(activation="tanh"),
-    svgd=dataclasses.replace(NCHAIN_PAPER.svgd, temperature=0.3),
+    svgd=dataclasses.replace(NCHAIN_PAPER.svgd, temperature=0.003),
     ddqn=dataclasses.replace(NCHAIN_PAPER.ddqn, lr=1e-3),
     fit=dataclasses.replace(NCHAIN_PAPER.fit, lr=1e-3, epochs=0, steps=10),
     mcts=MCTSConfig(num_iterations=100, num_trajectories=300),
