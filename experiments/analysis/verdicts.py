@@ -71,6 +71,17 @@ def at_least(label: str, least: float, part: int = 0) -> Condition:
     return Condition(f"{label} at {least:.0%} on every seed", part, decide, of_ends=True)
 
 
+def stays(label: str, part: int = 0) -> Condition:
+    """A label's curves are as high later as at first, on average: the 95 % interval of the measure's number, later over
+    at first, is at or above 1. It does not hold where the interval is below.
+    """
+
+    def decide(scores: Scores) -> tuple[Answer, str]:
+        return _beside(label, scores, lambda low, high: (low >= 1.0, high < 1.0))
+
+    return Condition(f"{label} as high later as at first", part, decide)
+
+
 def _beside(label: str, scores: Scores, compare: Callable[[float, float], tuple[bool, bool]]) -> tuple[Answer, str]:
     values = np.array(list(scores.get(label, {}).values()))
     if not len(values):

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Any, Literal, NamedTuple
 
 from experiments.analysis.measures import CELLS, COVERAGE, RETURN, VARIANCE, VISITS, WHOLE, Measure
-from experiments.analysis.verdicts import Condition, ahead, at_least, at_most
+from experiments.analysis.verdicts import Condition, ahead, at_least, at_most, stays
 from experiments.runs.config import RunConfig, replace
 from experiments.runs.presets import preset_config
 from jaxplore import METHODS, validate
@@ -214,7 +214,7 @@ def figures() -> dict[str, Figure]:
             "The variance of ours rises while there is something to find and stays high until the maze is seen; that "
             "of MAX's ensemble falls from step 2,000 on.",
             (Part("Equation 1 on the transitions just met, mean of each round", VARIANCE, (ANT[0], ANT[4])),),
-            (ahead(OURS, "max"),),
+            (stays(OURS), ahead(OURS, "max")),
         ),
         Figure(
             "ant_visits",

@@ -1,6 +1,6 @@
 import pytest
 
-from experiments.analysis.verdicts import ahead, at_least, at_most, judge
+from experiments.analysis.verdicts import ahead, at_least, at_most, judge, stays
 
 GOOD, BAD, MIXED = {0: 0.9, 1: 0.8, 2: 0.85}, {0: 0.1, 1: 0.05, 2: 0.0}, {0: 0.2, 1: 0.9, 2: 0.1}
 
@@ -24,6 +24,13 @@ def test_ahead_is_the_paired_interval_above_nothing(scores, answer: str):
 def test_its_words_have_the_difference_and_its_interval():
     # Differences 0.8, 0.75, 0.85: mean 0.8, deviation 0.05, t(2) = 4.303, so 4.303 * 0.05 / sqrt(3) = 0.124.
     assert ahead("a", "b").decide({"a": GOOD, "b": BAD})[1] == "a less b: 0.8 ± 0.12 on 3 seeds"
+
+
+def test_what_stays_is_as_high_later():
+    assert stays("a").decide({"a": {0: 1.1, 1: 1.2, 2: 1.15}})[0] == "holds"
+    assert stays("a").decide({"a": {0: 0.4, 1: 0.3, 2: 0.35}}) == ("does not hold", "a: 0.35 ± 0.12")
+    assert stays("a").decide({"a": {0: 0.5, 1: 1.5, 2: 1.0}})[0] == "undecided"
+    assert stays("a").decide({})[0] == "not run"
 
 
 def test_at_most_and_at_least():
