@@ -54,14 +54,23 @@ def test_a_kind_is_judged_by_hand():
     )
 
     class Fake:
+        """Pairs of models, each of a generator of its own."""
+
+        def __init__(self, num_groups: int):
+            self.num_groups, self.num_models = num_groups, 2 * num_groups
+
         def judge(self, models, normalizers, rows):
-            mean = jnp.stack([0.0 * rows.obs, 2.0 * rows.obs])
+            mean = jnp.stack([0.0 * rows.obs, 2.0 * rows.obs] * self.num_groups)
             return Prediction(mean), rows.obs - rows.obs
 
-    found = beliefs.judge(Fake(), (), (), rows)  # pyright: ignore[reportArgumentType]
-    assert found.error == found.variance == pytest.approx(np.mean(numbers**2))
-    assert found.ratio == pytest.approx(1.0)
-    assert found.rank == pytest.approx(1.0)
+    for num_groups in (1, 3):
+        found = beliefs.judge(Fake(num_groups), (), (), rows)  # pyright: ignore[reportArgumentType]
+        assert found.error == pytest.approx(np.mean(numbers**2))
+        assert found.variance == pytest.approx(np.mean(numbers**2))
+        assert found.ratio == pytest.approx(1.0)
+        assert found.rank == pytest.approx(1.0)
+        # a generator's own is the unbiased variance of two, twice the other; with one there is nothing to tell apart
+        assert found.within == (pytest.approx(2 * np.mean(numbers**2)) if num_groups > 1 else None)
 
 
 @pytest.mark.parametrize("name", ["ant_maze", "acrobot", "half_cheetah"])
