@@ -91,7 +91,7 @@ def test_one_figure_from_the_runs_to_the_page(small: str, tmp_path: Path):
         (["chain", "--port=70000"], "--port=70000 is out of range. Allowed: a whole number, 0 to 65535."),
         (["chain", "--every=0"], "--every=0.0"),
         (["chain", "--import=no_such"], "--import=no_such: cannot import it"),
-        (["chain", "--report"], "--report: no run of these figures is finished in --out="),
+        (["chain", "--preset=smoke", "--report"], "--report: no run of these figures is finished in --out="),
     ],
 )
 def test_bad_input_is_one_line_and_writes_nothing(
