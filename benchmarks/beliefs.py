@@ -115,21 +115,20 @@ def judge(belief: Belief, models: Any, normalizers: dynamics.Normalizers, rows: 
     """What models make of transitions `[N, ...]`."""
 
     @jax.jit
-    def some(models: Any, rows: Transition) -> tuple[Any, Any, Any]:
+    def some(models: Any, rows: Transition) -> tuple[Any, ...]:
         prediction, target = belief.judge(models, normalizers, rows)
-        variance = rewards.variance(prediction)
-        within = rewards.variance_within(prediction, belief.num_groups) if grouped else jnp.zeros_like(variance)
-        return variance, rewards.prediction_error(prediction, target), within
+        within = [rewards.variance_within(prediction, belief.num_groups)] if belief.has_groups else []
+        return rewards.variance(prediction), rewards.prediction_error(prediction, target), *within
 
-    grouped = 1 < belief.num_groups < belief.num_models
     num = len(rows.obs)
     places = (np.arange(-(-num // CHUNK) * CHUNK) % num).reshape(-1, CHUNK)
     parts = [jax.device_get(some(models, jax.tree.map(lambda leaf, at=at: leaf[at], rows))) for at in places]
-    variance, error, within = (np.concatenate(column)[:num] for column in zip(*parts, strict=True))
+    variance, error, *within = (np.concatenate(column)[:num] for column in zip(*parts, strict=True))
     ratio = float(np.exp(np.mean(np.log(np.maximum(error, 1e-12)) - np.log(np.maximum(variance, 1e-12)))))
     found: Any = stats.spearmanr(variance, error)
-    own = float(within.mean()) if grouped else None
-    return Kind(float(error.mean()), float(variance.mean()), ratio, float(found[0]), own)
+    return Kind(
+        *(float(error.mean()), float(variance.mean()), ratio, float(found[0])), *(float(one.mean()) for one in within)
+    )
 
 
 def verdict(name: str, method: str, config: ExplorationConfig, steps: int, seed: int) -> Verdict:

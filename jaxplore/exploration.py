@@ -260,7 +260,7 @@ def assess(agent: Agent, key: Key, state: ExplorerState, transitions: Transition
     if belief.predict is None:
         return _spreads(of_each, counts)
     of_each["variance"] = rewards.variance(seen.prediction)
-    if 1 < belief.num_groups < belief.num_models:
+    if belief.has_groups:
         of_each["variance_within"] = rewards.variance_within(seen.prediction, belief.num_groups)
     of_each["divergence"] = agent.divergence(seen.prediction, seen.delta, state.normalizers)
     errors = jnp.mean((jnp.mean(seen.prediction.mean, axis=0) - seen.delta) ** 2, axis=-1)

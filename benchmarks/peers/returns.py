@@ -17,7 +17,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from benchmarks.peers import EXTRA
 from benchmarks.peers.common import torch_on_one_thread
+from experiments import process
 from experiments.runs.files import write_text
 from experiments.runtime import set_cpu_switches
 
@@ -63,8 +65,8 @@ def train(library: str, seed: int, steps: int, warm_up: int, every: int, episode
     return {**who, "warm_up_steps": warm_up, "rows": rows}
 
 
-def main() -> None:
-    """The command line."""
+def main() -> int:
+    """The command line; the exit status is 0, or 2 for bad input."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--library", choices=sorted(LIBRARIES), required=True)
     parser.add_argument("--seed", type=int, default=0)
@@ -74,12 +76,19 @@ def main() -> None:
     parser.add_argument("--eval-episodes", type=int, default=5)
     parser.add_argument("--out", type=Path, required=True, help="a JSON file")
     args = parser.parse_args()
+    for name in ("steps", "eval_every", "eval_episodes"):
+        if getattr(args, name) < 1:
+            parser.error(f"--{name.replace('_', '-')}={getattr(args, name)}. Allowed: a whole number, 1 or more.")
     if not args.out.parent.is_dir():
-        parser.error(f"--out={args.out}: its folder does not exist")
+        parser.error(f"--out={args.out}. Allowed: a file in a directory that is there.")
     set_cpu_switches()
-    result = train(args.library, args.seed, args.steps, args.warm_up_steps, args.eval_every, args.eval_episodes)
+    try:
+        result = train(args.library, args.seed, args.steps, args.warm_up_steps, args.eval_every, args.eval_episodes)
+    except ModuleNotFoundError as error:
+        parser.error(f"--library={args.library}: {error.name} is not installed. What to do: {EXTRA}.")
     write_text(args.out, json.dumps(result, indent=1) + "\n")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    process.carry_out(main)

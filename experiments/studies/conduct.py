@@ -103,12 +103,11 @@ def carry_out(
                 if why is None:
                     if now[key].state is not State.FINISHED:
                         tries[key] = 1 if now[key].step > before.step else tries.get(key, 0) + 1
-                        outside = end.error or "it ended from outside"
                         if tries[key] < TRIES:
                             waiting.insert(0, key)
-                            again(key, outside)
+                            again(key, end.error or "it ended from outside")
                         else:
-                            failed[key] = outside
+                            failed[key] = end.error or "it ended from outside, time and again"
                     continue
                 failed[key] = why
         tell(now, [], failed, 0)

@@ -247,7 +247,8 @@ def look(job: Job, finished: Mapping[str, Path] | None = None) -> Standing:
     elsewhere = (finished or {}).get(job.key)
     if elsewhere is not None:
         other = RunDirectory(elsewhere)
-        if not (job.is_parent and other.is_kept()) and not (job.needs_walk and not other.has_walk()):
+        lacks_state, lacks_walk = job.is_parent and other.is_kept(), job.needs_walk and not other.has_walk()
+        if not lacks_state and not lacks_walk:
             return Standing(State.FINISHED, config.steps, elsewhere)
     row = last_row(directory.metrics_path)
     step = row["step"] if row else 0

@@ -136,13 +136,12 @@ def dying(rows: Sequence[Mapping[str, Any]]) -> str:
             "its networks are nearly one. ReLU's, which the paper has, die; with --generator.activation=tanh and "
             "--svgd.batches=shared none do."
         )
-    shares = [
-        row["variance_within"] / row["variance"] for row in rows if row.get("variance_within") and row["variance"]
-    ]
+    told = [row for row in rows if row.get("variance_within") is not None and row.get("variance")]
+    shares = [row["variance_within"] / row["variance"] for row in told]
     if min(shares, default=1.0) < FEW_WITHIN:
         return (
             f"warning: networks of one generator make {min(shares):.1%} of the variance of all (variance_within), so "
             "that each generator stands for one network. With --svgd.batches=own nothing keeps them apart; with "
-            "--svgd.batches=shared the repulsion of SVGD does."
+            "--svgd.batches=shared the repulsion of SVGD does, the more, the higher --svgd.temperature is."
         )
     return ""

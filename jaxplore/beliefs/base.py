@@ -98,6 +98,11 @@ class Belief(NamedTuple):
     fit_config: FitConfig | None = None
     """How it is fitted in a round. None: not at all."""
 
+    @property
+    def has_groups(self) -> bool:
+        """Whether there are several groups, of several models each."""
+        return 1 < self.num_groups < self.num_models
+
     def imagine(self, models: Any, normalizers: Normalizers, obs: Array, action: Array) -> Prediction:
         """What models predict of `obs [N, O]` and `action [N, A]`, raw units: `[M, N, O]`.
 

@@ -57,7 +57,7 @@ def test_a_kind_is_judged_by_hand():
         """Pairs of models, each of a generator of its own."""
 
         def __init__(self, num_groups: int):
-            self.num_groups, self.num_models = num_groups, 2 * num_groups
+            self.num_groups, self.has_groups = num_groups, num_groups > 1
 
         def judge(self, models, normalizers, rows):
             mean = jnp.stack([0.0 * rows.obs, 2.0 * rows.obs] * self.num_groups)

@@ -244,9 +244,28 @@ def test_a_whole_run_of_a_peer_is_evaluated_as_ours_are(monkeypatch, tmp_path):
     out = tmp_path / "run.json"
     flags = ["--steps=25", "--eval-every=10", "--eval-episodes=2", "--warm-up-steps=7", f"--out={out}"]
     monkeypatch.setattr(sys, "argv", ["returns", "--library=sbx", *flags])
-    returns.main()
+    assert returns.main() == 0
     stored = run.json.loads(out.read_text())
     assert [row["env_steps"] for row in stored["rows"]] == [10, 20, 25] and stored["warm_up_steps"] == 7
     # A cheetah that does nothing stays where it is, but for how it lands.
     assert all(abs(row["return"]) < 50 for row in stored["rows"])
     assert stored["rows"][0]["return_std"] > 0
+
+
+@pytest.mark.parametrize(
+    ("flag", "message"),
+    [
+        ("--eval-every=0", "--eval-every=0. Allowed: a whole number, 1 or more."),
+        ("--out=nowhere/run.json", "--out=nowhere/run.json. Allowed: a file in a directory that is there."),
+        ("--seed=1", "--library=sbx: sbx is not installed. What to do: "),
+    ],
+)
+def test_a_run_of_a_peer_that_cannot_be_is_refused_in_a_line(flag, message, monkeypatch, tmp_path, capsys):
+    def missing(*_):
+        raise ModuleNotFoundError("No module named 'sbx'", name="sbx")
+
+    monkeypatch.setattr(returns, "train", missing)
+    monkeypatch.setattr(sys, "argv", ["returns", "--library=sbx", f"--out={tmp_path / 'run.json'}", flag])
+    with pytest.raises(SystemExit, match="2"):
+        returns.main()
+    assert message in capsys.readouterr().err and list(tmp_path.iterdir()) == []

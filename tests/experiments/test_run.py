@@ -617,6 +617,7 @@ def test_a_dying_generator_is_warned_of_once():
     assert record.dying(rows[:1]) == record.dying([{}]) == record.dying([]) == ""
     one = {"variance": 4.0, "variance_within": 0.1}
     assert re.match(r"warning: .* make 2\.5% of the variance .*--svgd\.batches=shared", record.dying([one]))
+    assert " make 0.0% of the variance " in record.dying([one | {"variance_within": 0.0}])
     assert record.dying([one | {"variance_within": 1.0}]) == record.dying([{"variance": 4.0}]) == ""
     said: list[str] = []
     session: Any = loop.Session.__new__(loop.Session)

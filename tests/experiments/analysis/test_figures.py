@@ -189,8 +189,17 @@ def test_unwritable_pictures_are_named(tmp_path: Path):
         plot_coverage(tmp_path / "file" / "c.png", [Curves("implicit", STEPS, seeds(1))], COVERAGE)
 
 
+QUICK = {(1, 2), (2, None), (4, None), (5, 2), (8, None), (8, 2), (9, None), (25, 2)}
+"""Each number of curves, and each form of the legend, once; the other pairs are slow together."""
+
+
 @pytest.mark.parametrize(
-    ("count", "reachable"), [(1, 2), (2, None), (4, None), (5, 2), (8, None), (8, 2), (9, None), (25, 2)]
+    ("count", "reachable"),
+    [
+        pytest.param(count, reachable, marks=[] if (count, reachable) in QUICK else [pytest.mark.slow])
+        for count in (1, 2, 4, 5, 8, 9, 25)
+        for reachable in (None, 2)
+    ],
 )
 def test_no_legend_covers_a_curve(tmp_path: Path, figures: list[Figure], count: int, reachable: int | None):
     # Curves that leave no corner free.

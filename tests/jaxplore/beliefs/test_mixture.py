@@ -38,6 +38,7 @@ def test_each_is_updated_on_a_batch_of_its_own_as_if_alone(data):
     belief, alone = make(), make(dataclasses.replace(GENERATOR, num_generators=1), M // K)
     assert (belief.num_models, alone.num_models) == (M, M // K)
     assert (belief.num_groups, alone.num_groups) == (K, 1)
+    assert (belief.has_groups, alone.has_groups, belief._replace(num_models=K).has_groups) == (True, False, False)
     init_key, key = jax.random.split(jax.random.key(0))
     state = jax.jit(belief.init)(init_key)
     after, metrics = jax.jit(belief.update)(key, state, *data)
