@@ -5,8 +5,8 @@
 
 `oracle_counts` is given the novelty that a belief's uncertainty stands for: a real transition is worth
 1 / sqrt(visits) of the square of 0.5 m that it leads to. `oracle_distance` is paid for each metre along the corridor,
-so that it shows how soon this ant can be at the end of it at all. Both train SAC on real transitions, with the settings
-of `icm` (`--reactive.*`, `--sac.*`), and model nothing.
+so that it shows how soon this ant can be at the end of it at all. Both train SAC on real transitions (`--reactive.*`,
+`--sac.*`; the preset's, not those that were chosen for one method), and model nothing.
 """
 
 from typing import Any

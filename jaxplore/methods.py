@@ -144,10 +144,20 @@ def as_max_reactive(config: ExplorationConfig) -> ExplorationConfig:
     return dataclasses.replace(config, reactive=dataclasses.replace(config.reactive, updates=100))
 
 
+def in_imagination_alone(config: ExplorationConfig) -> ExplorationConfig:
+    """No real transitions in a batch, as in nnaisense/max: on these alone it would be another row of the table."""
+    return dataclasses.replace(config, imagination=dataclasses.replace(config.imagination, real_fraction=0.0))
+
+
 def as_max_trajectory(config: ExplorationConfig) -> ExplorationConfig:
-    """nnaisense/max's command TVAX: alpha 0.2."""
-    config = as_max(config)
-    return dataclasses.replace(config, sac=dataclasses.replace(config.sac, alpha=0.2))
+    """nnaisense/max's command TVAX: alpha 0.2. Its reward is one number for all that is imagined in a step, so that it
+    can say nothing of real transitions."""
+    config = in_imagination_alone(as_max(config))
+    return dataclasses.replace(
+        config,
+        sac=dataclasses.replace(config.sac, alpha=0.2),
+        imagination=dataclasses.replace(config.imagination, real_updates=0),
+    )
 
 
 def as_max_prediction_error(config: ExplorationConfig) -> ExplorationConfig:
@@ -218,6 +228,7 @@ METHODS: dict[str, Method] = {
         "static networks, error of their mean, SAC in imagination, where a model stands for the truth",
         read_off(static_belief, error_reward),
         sac_in_imagination,
+        settings=in_imagination_alone,
         finite=False,
     ),
     "disagreement_grad": Method(
@@ -241,6 +252,7 @@ METHODS: dict[str, Method] = {
         "random network distillation with SAC in imagination, by static networks",
         distillation_beside(static_belief),
         sac_in_imagination,
+        settings=in_imagination_alone,
         finite=False,
     ),
     "ddqn": Method(

@@ -50,7 +50,7 @@ LAPTOP = ExplorationConfig(
         updates=100, batch_size=64, hidden=(128, 128), restart=False, normalize_reward=True, bound=10.0
     ),
     rnd=RNDConfig(hidden=(64, 64), features=64, lr=1e-3),
-    ppo=PPOConfig(hidden=(64, 64), rollout_steps=128, epochs=4, minibatch_size=32),
+    ppo=PPOConfig(hidden=(64, 64)),
 )
 """Settings for a laptop without a GPU: four generators, whose features cannot die and whose draws SVGD keeps apart, and
 a policy that learns from what happened. See `experiments/results/ant_maze_laptop/TUNING.md`."""

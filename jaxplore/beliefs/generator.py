@@ -52,7 +52,7 @@ class GeneratorConfig:
     """Whether features are normalised over their units, for each z: mean 0 and variance 1."""
     num_generators: int = 1
     """K, generators of their own within one belief, each with its own features and heads, and `num_particles / K` of
-    the networks. Networks of one generator err together, those of several apart. Paper: 1."""
+    the networks. Those of one generator differ by z, those of several by where they started, too. Paper: 1."""
     bootstrap: Bootstrap = "none"
     """Weights of transitions, fixed for each generator and transition as for a static ensemble's members; see
     `EnsembleConfig.bootstrap`."""
@@ -76,7 +76,12 @@ class GeneratorConfig:
         checks.in_range("bias_std", 0.0)
         checks.one_of("activation", ACTIVATIONS)
         checks.at_least("num_generators", 1)
+        if self.normalize and self.hidden[-1] == 1:
+            raise checks.refusal("normalize", "leaves nothing of one feature", "a last width of hidden of 2 or more")
         checks.one_of("bootstrap", get_args(Bootstrap))
+        if self.bootstrap != "none" and self.num_generators == 1:
+            allowed = "'none', or num_generators of 2 or more"
+            raise checks.refusal("bootstrap", "tells generators apart, and there is one", allowed)
         checks.in_range("bootstrap_std", 0.0, 1.0, open_low=True)
         checks.in_range("prior_scale", 0.0)
 

@@ -155,6 +155,17 @@ def test_the_laptops_generators_are_kept_apart(env: str):
     assert (explorer.svgd.batches, explorer.generator.activation) == ("shared", "tanh")
 
 
+@pytest.mark.parametrize("method", ["max_trajectory", "icm_active", "rnd_active"])
+@pytest.mark.parametrize("preset", PRESETS)
+def test_what_is_of_imagination_imagines(method: str, preset: str):
+    """Where a preset learns from real transitions alone, these would be another method, or, where the reward compares
+    the rows of one imagined step, none."""
+    imagination = preset_config(preset, "ant_maze", method).explorer.imagination
+    assert imagination.real_fraction == 0.0
+    if method == "max_trajectory":
+        assert imagination.real_updates == 0
+
+
 def test_the_papers_methods_are_fitted_alike():
     assert preset_config("paper", "ant_maze").explorer.fit == preset_config("paper", "ant_maze", "max").explorer.fit
 

@@ -255,7 +255,7 @@ def test_policy_finds_the_best_action(trained):
 @pytest.mark.slow
 def test_balances_a_pole():
     # an episode is 200 steps if the pole stays up, about 20 under random pushes
-    config = PPOConfig(hidden=(64, 64), rollout_steps=1024, extrinsic_weight=1.0, intrinsic_weight=0.0)
+    config = PPOConfig(hidden=(64, 64), rollout_steps=1024, minibatch_size=64, epochs=10, extrinsic_weight=1.0, intrinsic_weight=0.0)
     ppo = make_ppo(4, 1, config)
 
     def rollout(carry, key):
@@ -285,7 +285,7 @@ def test_balances_a_pole():
         ({"clip": 0.0}, r"PPOConfig\.clip=0\.0 .*\(0, inf"),
         ({"gae_lambda": 1.5}, r"PPOConfig\.gae_lambda=1\.5 .*\[0, 1\]"),
         ({"epochs": 0}, r"PPOConfig\.epochs=0 .*1 or more"),
-        ({"rollout_steps": 32}, r"minibatch_size=64 .*at most rollout_steps=32"),
+        ({"rollout_steps": 16}, r"minibatch_size=32 .*at most rollout_steps=16"),
     ],
 )
 def test_bad_settings_are_refused(settings, message):
