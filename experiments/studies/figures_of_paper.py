@@ -92,7 +92,7 @@ ACROBOT_STEPS = {"paper": 1_000, "laptop": 1_000, "smoke": 100}
 EXPLORE_STEPS = {"paper": 10_000, "laptop": 10_000, "smoke": 100}
 MAZE_STEPS = {**EXPLORE_STEPS, "laptop": 5_500}
 """By 5,500 the paper's agent has seen the whole maze on every seed."""
-TASK_STEPS = {"paper": 1_000_000, "laptop": 200_000, "smoke": 100}
+TASK_STEPS = {"paper": 1_000_000, "laptop": 100_000, "smoke": 100}
 """Of a task's policy, the exploration before it included."""
 WARM_UP_STEPS = {"paper": 10_000, "laptop": 10_000, "smoke": 50}
 LENGTHS = {"2k": 2_000, "4k": 4_000, "6k": 6_000, "8k": 8_000}
@@ -104,6 +104,13 @@ FEW = (OURS, *RIVALS, "disagreement_grad", "implicit_reactive", "max_trajectory"
 SMOKE_EXPLORER = {"warm_up_steps": 50}
 OF_RUN = {**OWN_SEEDS, "smoke": {"checkpoint_every": 50, "explorer": SMOKE_EXPLORER}}
 OF_CHAIN = {**OWN_SEEDS, "smoke": {"checkpoint_every": 49, "explorer": {"warm_up_steps": 49}}}
+
+
+def _merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    both = dict(below)
+    for name, value in above.items():
+        both[name] = _merge(both.get(name, {}), value) if isinstance(value, Mapping) else value
+    return both
 
 
 def _cells(env: str, methods: tuple[str, ...], seeds: int, steps: Mapping[str, int]) -> tuple[Cell, ...]:
@@ -119,12 +126,26 @@ HAND = _cells("hand_block", (OURS, *RIVALS), CONTROL_SEEDS, EXPLORE_STEPS)
 TASK = "half_cheetah_task"
 SAME_WIDTHS = {"laptop": (128, 128), "smoke": (32, 32), "paper": (256, 256)}
 """Of SAC's networks while it explores and on the task: one takes over the other's."""
+SAME_FORM = {"activation": "relu", "log_std_map": "clip", "log_std_min": -20.0, "log_std_max": 2.0}
+"""The rest of what a policy's parameters mean: as SAC's authors have it on the task."""
 SAC_EXPLORING = {"lr": 1e-3, "alpha": 0.02, "reward_scale": 1.0}
 """SAC on the task with the numbers that exploration has; the paper's table has both."""
+LIFE = {"imagination": {"restart_every": 20}, "reactive": {"restart_every": 20}}
+"""With the laptop preset a policy lives for several rounds, and 2,000 steps are 80 of them: with a life that divides
+80, here one of 20 rounds, the policy that is handed on has learned for 11 whatever the length of the exploration."""
 
-PARENTS = {method: _cells(TASK, (method,), TRANSFER_SEEDS, EXPLORE_STEPS)[0] for method in (OURS, *RIVALS)}
+
+def _explorer(method: str) -> Cell:
+    """Exploration on the task's environment, with a policy of the form that the task's has."""
+    by_preset = dict(OF_RUN)
+    for preset, hidden in SAME_WIDTHS.items():
+        life = LIFE if preset == "laptop" else {}
+        sac = {"sac": {**SAME_FORM, "hidden": hidden}}
+        by_preset[preset] = _merge(OF_RUN.get(preset, {}), {"explorer": {**sac, **life}})
+    return _cells(TASK, (method,), TRANSFER_SEEDS, EXPLORE_STEPS)[0]._replace(by_preset=by_preset)
 
 
+PARENTS = {method: _explorer(method) for method in (OURS, *RIVALS)}
 PARENTS[OURS] = PARENTS[OURS]._replace(
     keep_at={preset: tuple(dict.fromkeys(AT[preset].values())) for preset in ("paper", "laptop", "smoke")}
 )
@@ -304,6 +325,15 @@ def figures() -> dict[str, Figure]:
             (ahead(OURS, "rnd"), ahead(OURS, "psne"), ahead(OURS, "rnd", 1)),
         ),
         Figure(
+            "transfer_today",
+            "HalfCheetah, beside what seeks information while it learns the task",
+            "beyond the paper",
+            "A policy that explored first is as good at the task as one that seeks its models' information on the way "
+            "(MaxInfoRL, Sukhija et al. 2024), with either belief.",
+            (Part("Return", RETURN, (WARM[0], *_beside("maxinfo", "maxinfo_implicit", "sac_v2"))),),
+            (ahead(OURS, "maxinfo"), ahead(OURS, "sac_v2"), ahead("maxinfo_implicit", "maxinfo")),
+        ),
+        Figure(
             "methods",
             "Every method",
             "beyond the paper",
@@ -326,8 +356,16 @@ def figures() -> dict[str, Figure]:
     return {figure.name: figure for figure in found}
 
 
+def _beside(*methods: str) -> tuple[Cell, ...]:
+    """Other methods at the task, for as long as SAC."""
+    return tuple(SAC_WARM._replace(label=method, method=method, warm_up=None) for method in methods)
+
+
 def _baselines() -> tuple[Cell, ...]:
-    return tuple(SAC_WARM._replace(label=method, method=method, warm_up=None) for method in ("rnd", "psne"))
+    """RND weighs the task's advantage twice as its own (Burda et al. 2019); PSNE has nothing but the task's."""
+    rnd, psne = _beside("rnd", "psne")
+    weights = {"explorer": {"ppo": {"extrinsic_weight": 2.0}}}
+    return rnd._replace(by_preset={preset: _merge(rnd.by_preset[preset], weights) for preset in TASK_STEPS}), psne
 
 
 def choose(names: tuple[str, ...]) -> list[Figure]:
@@ -364,10 +402,3 @@ def config_of(cell: Cell, preset: str) -> RunConfig:
     if cell.warm_up is not None:
         changes["warm_up"] = cell.warm_up
     return replace(config, changes)
-
-
-def _merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    both = dict(below)
-    for name, value in above.items():
-        both[name] = _merge(both.get(name, {}), value) if isinstance(value, Mapping) else value
-    return both

@@ -3,12 +3,13 @@ import dataclasses
 import pytest
 
 from experiments.runs.config import PRESETS, RunConfig
+from experiments.runs.inherit import form_of
 from experiments.studies import figures_of_paper
 from experiments.studies.figures_of_paper import config_of, figures
 from jaxplore.validate import FieldError
 
 NAMES = ("chain", "acrobot", "ant_coverage", "ant_reward", "ant_visits", "hand", "transfer", "transfer_length")
-NAMES = (*NAMES, "transfer_cold", "table_sac", "disagreement_full", "rnd_psne", "methods", "beliefs")
+NAMES = (*NAMES, "transfer_cold", "table_sac", "disagreement_full", "rnd_psne", "transfer_today", "methods", "beliefs")
 
 
 def test_every_figure_is_there_in_the_papers_order():
@@ -41,6 +42,37 @@ def test_the_papers_seeds_and_steps():
     assert task == {"implicit": 990_000, "max": 990_000, "icm": 990_000, "disagreement": 990_000, "sac": 1_000_000}
     lengths = {cell.label: config_of(cell, "paper").steps for cell in figures()["transfer_length"].parts[0].cells}
     assert lengths["init-2k"] == 998_000 and lengths["init-10k"] == 990_000
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_what_is_handed_on_has_the_form_that_the_task_has(preset: str):
+    """So that a difference between the two is what the weights know, and not another network."""
+    warm = figures()["transfer"].parts[0].cells
+    (alone,) = [form_of(config_of(cell, preset)) for cell in warm if cell.parent is None]
+    parents = [cell.parent for cell in warm if cell.parent is not None]
+    assert len(parents) == 4
+    for parent in parents:
+        assert form_of(config_of(parent, preset)) == alone
+
+
+def test_as_much_has_been_learned_by_whatever_policy_is_handed_on():
+    """A policy of the laptop preset lives for several rounds, and each length of exploration ends in the same one."""
+    config = config_of(figures_of_paper.PARENTS["implicit"], "laptop")
+    explorer, life = config.explorer, config.explorer.imagination.restart_every
+    ages = {
+        (step - explorer.warm_up_steps) // explorer.steps_per_round % life for step in (*config.keep_at, config.steps)
+    }
+    assert len(config.keep_at) == 4 and len(ages) == 1
+    assert config_of(figures_of_paper.PARENTS["icm"], "laptop").explorer.reactive.restart_every == life
+
+
+def test_rnd_is_paid_for_the_task_on_the_cheetah_and_not_in_the_maze():
+    task, maze = figures()["rnd_psne"].parts
+    (cheetah,) = [cell for cell in task.cells if cell.method == "rnd"]
+    (ant,) = [cell for cell in maze.cells if cell.method == "rnd"]
+    for preset in PRESETS:
+        assert config_of(cheetah, preset).explorer.ppo.extrinsic_weight == 2.0
+        assert config_of(ant, preset).explorer.ppo.extrinsic_weight == 0.0
 
 
 def test_conditions_ask_for_labels_that_there_are():

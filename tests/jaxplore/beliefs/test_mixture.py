@@ -114,7 +114,9 @@ def test_a_number_that_does_not_divide_is_refused():
         GeneratorConfig(activation="tanhh")
     with pytest.raises(ValueError, match=r"GeneratorConfig\.bootstrap='poison' .*Did you mean 'poisson'"):
         GeneratorConfig(bootstrap="poison")  # pyright: ignore[reportArgumentType]
-    with pytest.raises(ValueError, match=r"GeneratorConfig\.bootstrap='poisson' tells generators apart.*num_generators"):
+    with pytest.raises(
+        ValueError, match=r"GeneratorConfig\.bootstrap='poisson' tells generators apart.*num_generators"
+    ):
         GeneratorConfig(bootstrap="poisson")
     with pytest.raises(ValueError, match=r"GeneratorConfig\.normalize=True leaves nothing of one feature.*2 or more"):
         GeneratorConfig(hidden=(8, 1), normalize=True)

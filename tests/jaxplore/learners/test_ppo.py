@@ -255,7 +255,9 @@ def test_policy_finds_the_best_action(trained):
 @pytest.mark.slow
 def test_balances_a_pole():
     # an episode is 200 steps if the pole stays up, about 20 under random pushes
-    config = PPOConfig(hidden=(64, 64), rollout_steps=1024, minibatch_size=64, epochs=10, extrinsic_weight=1.0, intrinsic_weight=0.0)
+    config = PPOConfig(
+        hidden=(64, 64), rollout_steps=1024, minibatch_size=64, epochs=10, extrinsic_weight=1.0, intrinsic_weight=0.0
+    )
     ppo = make_ppo(4, 1, config)
 
     def rollout(carry, key):
