@@ -4,7 +4,7 @@ import dataclasses
 from typing import Any, cast
 
 import envs
-from experiments.runs.config import PRESETS, Preset, RunConfig
+from experiments.runs.config import PRESETS, Preset, RunConfig, replace
 from jaxplore import (
     METHODS,
     DynamicsConfig,
@@ -138,9 +138,18 @@ ENVIRONMENTS: dict[str, dict[str, dict[str, Any]]] = {
 }
 """Environment -> preset -> the fields in which it departs from the defaults. A new environment adds its own."""
 
-CHOSEN_ALPHA: dict[str, dict[str, float]] = {"laptop": {"disagreement": 0.02, "icm": 0.02, "max": 0.1}}
-"""Preset -> method -> SAC's weight of entropy, where one was chosen for it, in the maze, by a search of the same size
-as the others', and is not the preset's."""
+LITTLE_ENTROPY, MUCH_ENTROPY = {"sac": {"alpha": 0.02}}, {"sac": {"alpha": 0.1}}
+RESAMPLED = {"ensemble": {"bootstrap": "poisson"}}
+OF_METHOD: dict[str, dict[str, dict[str, Any]]] = {
+    "laptop": {
+        **dict.fromkeys(("disagreement", "disagreement_reactive", "icm", "icm_active"), LITTLE_ENTROPY),
+        **dict.fromkeys(("max", "max_reactive"), MUCH_ENTROPY),
+    },
+    "paper": dict.fromkeys(("disagreement", "disagreement_reactive", "disagreement_grad"), RESAMPLED),
+}
+"""Preset -> method -> the explorer's settings that are its own. Laptop: SAC's weight of entropy, chosen in the maze
+for `disagreement`, `icm` and `max` by a search of the same size as for `implicit`, and what has the same reward has it,
+too. Paper: the "bootstrap ensemble" of disagreement."""
 
 TASK_RUN = {"steps": 1_000_000, "checkpoint_every": 10_000, "eval_every": 5_000}
 """A million steps, as the paper has them, evaluated every 5,000."""
@@ -170,9 +179,8 @@ def preset_config(preset: str, env: str = "ant_maze", method: str = "implicit") 
     validate.one_of("method", method, METHODS)
     envs.check_name(env)
     config = RunConfig(env=env, method=method, preset=cast(Preset, preset), **settings(preset, env))
-    explorer, row = config.explorer, METHODS[method]
-    alpha = CHOSEN_ALPHA.get(preset, {}).get(method, explorer.sac.alpha)
-    explorer = dataclasses.replace(explorer, sac=dataclasses.replace(explorer.sac, alpha=alpha))
+    row = METHODS[method]
+    explorer = replace(config.explorer, OF_METHOD.get(preset, {}).get(method, {}))
     run: dict[str, Any] = {}
     if row.needs_reward and (env, preset) in WITH_A_TASK:
         run, own = WITH_A_TASK[env, preset]

@@ -146,6 +146,18 @@ def test_what_was_chosen_for_the_generator_is_not_static_networks():
     assert preset_config("laptop", "ant_maze", "max_trajectory").explorer.sac.alpha == 0.2, "its authors' own"
 
 
+def test_disagreements_networks_are_a_bootstrap_where_the_preset_is_the_papers():
+    for name in ("disagreement", "disagreement_grad"):
+        assert preset_config("paper", "ant_maze", name).explorer.ensemble.bootstrap == "poisson"
+    assert preset_config("paper", "ant_maze", "max").explorer.ensemble.bootstrap == "none"
+
+
+def test_one_reward_has_one_weight_of_entropy():
+    for one, other in (("disagreement", "disagreement_reactive"), ("icm", "icm_active"), ("max", "max_reactive")):
+        here, there = (preset_config("laptop", "ant_maze", name).explorer for name in (one, other))
+        assert here.sac == there.sac
+
+
 @pytest.mark.parametrize("env", sorted(ENVIRONMENTS))
 def test_the_laptops_generators_are_kept_apart(env: str):
     """What makes them the paper's: several draws of a generator meet on one batch, where SVGD compares them, and no
