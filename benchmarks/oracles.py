@@ -2,11 +2,17 @@
 
     python -m experiments.run --import=benchmarks.oracles --env=ant_maze --method=oracle_counts
     python -m experiments.run --import=benchmarks.oracles --env=ant_maze --method=oracle_distance
+    python -m experiments.run --import=benchmarks.oracles --env=ant_maze --method=oracle_counts_imagined
+    python -m experiments.run --import=benchmarks.oracles --env=acrobot --method=oracle_simulator
 
 `oracle_counts` is given the novelty that a belief's uncertainty stands for: a real transition is worth
 1 / sqrt(visits) of the square of 0.5 m that it leads to. `oracle_distance` is paid for each metre along the corridor,
 so that it shows how soon this ant can be at the end of it at all. Both train SAC on real transitions (`--reactive.*`,
-`--sac.*`; the preset's, not those that were chosen for one method), and model nothing.
+`--sac.*`; the preset's, not those that were chosen for one method), and model nothing. `oracle_counts_imagined` has the
+same counts as a reward in what static networks imagine, and learns from nothing else.
+
+`oracle_simulator` asks what the errors of models cost: it is `implicit` in imagination alone
+(`--method=implicit --imagination.real-fraction=0`), but the acrobot's own equations move the actors.
 """
 
 from typing import Any
@@ -14,10 +20,34 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from envs import ant_maze
-from jaxplore import METHODS, ExplorationConfig, Method, Normalizers, Replay, Seen, Signal, Sizes, Transition
-from jaxplore.parts import reads, sac_on_real_data
+from envs import acrobot, ant_maze
+from jaxplore import (
+    METHODS,
+    Behaviour,
+    ExplorationConfig,
+    Method,
+    Normalizers,
+    Replay,
+    Seen,
+    Signal,
+    Sizes,
+    Transition,
+    make_imagination,
+    make_sac,
+)
+from jaxplore.methods import in_imagination_alone
+from jaxplore.parts import (
+    fields_read,
+    generator_belief,
+    read_off,
+    reads,
+    sac_in_imagination,
+    sac_on_real_data,
+    static_belief,
+    variance_reward,
+)
 from jaxplore.types import Array, Metrics
+from jaxplore.validate import FieldError
 
 SQUARE = 0.5
 """Side of a square whose visits are counted [m]."""
@@ -61,6 +91,12 @@ def counts(sizes: Sizes, config: ExplorationConfig) -> Signal:
     return Signal(rarity, "visits ** -0.5", init=lambda key: jnp.zeros(NUM * NUM), fit=fit)
 
 
+@reads(lambda config, discrete=False: fields_read(static_belief, config))
+def counts_beside_models(sizes: Sizes, config: ExplorationConfig) -> Signal:
+    """The same signal, with static networks that imagine."""
+    return counts(sizes, config)._replace(belief=static_belief(sizes, config))
+
+
 @reads()
 def distance(sizes: Sizes, config: ExplorationConfig) -> Signal:
     """A signal: metres along the corridor that a transition made."""
@@ -69,6 +105,29 @@ def distance(sizes: Sizes, config: ExplorationConfig) -> Signal:
         return along(seen.transitions.next_obs) - along(seen.transitions.obs)
 
     return Signal(progress, "m")
+
+
+def step_acrobot(obs: Array, action: Array) -> Array:
+    """Observations `[N, 6]` a step after `obs` under `action [N, 1]`, by the environment's own equations."""
+
+    def one(obs: Array, action: Array) -> Array:
+        state = jnp.stack([jnp.arctan2(obs[1], obs[0]), jnp.arctan2(obs[3], obs[2]), obs[4], obs[5]])
+        return acrobot.observe(state, acrobot.advance(jax.random.key(0), state, action))
+
+    return jax.vmap(one)(obs, action)
+
+
+@reads("imagination", "sac")
+def sac_in_the_acrobot(sizes: Sizes, config: ExplorationConfig, signal: Signal) -> Behaviour:
+    """A behaviour: SAC in rollouts of the true acrobot.
+
+    Raises:
+        FieldError: the environment has other observations or actions.
+    """
+    if (sizes.obs, sizes.action) != (len(acrobot.SPEC.obs_names), len(acrobot.SPEC.action_names)):
+        raise FieldError("env", f"one of {sizes.obs} observation entries", "acrobot", "cannot be simulated here")
+    sac = make_sac(sizes.obs, sizes.action, config.sac)
+    return make_imagination(signal, sac, sizes.obs, sizes.action, config.imagination, step=step_acrobot)
 
 
 METHODS["oracle_counts"] = Method(
@@ -82,4 +141,18 @@ METHODS["oracle_distance"] = Method(
     distance,
     sac_on_real_data,
     actions="continuous",
+)
+METHODS["oracle_counts_imagined"] = Method(
+    "true visits of squares of 0.5 m as the reward, SAC in what static networks imagine",
+    counts_beside_models,
+    sac_in_imagination,
+    actions="continuous",
+    settings=in_imagination_alone,
+)
+METHODS["oracle_simulator"] = Method(
+    "generator of models, variance reward, SAC in rollouts of the true acrobot",
+    read_off(generator_belief, variance_reward),
+    sac_in_the_acrobot,
+    actions="continuous",
+    settings=in_imagination_alone,
 )

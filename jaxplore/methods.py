@@ -151,7 +151,8 @@ def in_imagination_alone(config: ExplorationConfig) -> ExplorationConfig:
 
 def as_max_trajectory(config: ExplorationConfig) -> ExplorationConfig:
     """nnaisense/max's command TVAX: alpha 0.2. Its reward is one number for all that is imagined in a step, so that it
-    can say nothing of real transitions."""
+    can say nothing of real transitions.
+    """
     config = in_imagination_alone(as_max(config))
     return dataclasses.replace(
         config,

@@ -1,6 +1,7 @@
 """Behaviour by imagination: a learner is trained in rollouts of the belief's models (Algorithm 1, lines 7-9)."""
 
 import functools
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple, get_args
 
@@ -108,6 +109,8 @@ class Imagination(NamedTuple):
     config: ImaginationConfig
     discrete: bool
     """Whether an action is one of `A` choices, as a one-hot vector."""
+    step: Callable[[Array, Array], Array] | None
+    """See `World.step`."""
 
 
 def make_imagination(
@@ -117,6 +120,7 @@ def make_imagination(
     action_size: int,
     config: ImaginationConfig,
     discrete: bool = False,
+    step: Callable[[Array, Array], Array] | None = None,
 ) -> Behaviour:
     """Train a learner in rollouts imagined by the belief's models (Algorithm 1, lines 7-9).
 
@@ -127,6 +131,7 @@ def make_imagination(
         action_size: `A`.
         config: how much of everything.
         discrete: whether an action is one of `A` choices, as a one-hot vector.
+        step: a simulator that moves actors in place of the models; see `World.step`.
 
     Returns:
         A `Behaviour`. The metrics are the learner's, from the last update, and `imagined_reward`,
@@ -153,7 +158,7 @@ def make_imagination(
     validate.sizes(obs_size=obs_size, action_size=action_size)
     flag = jnp.zeros((), bool)
     example = Transition(jnp.zeros(obs_size), jnp.zeros(action_size), jnp.zeros(()), jnp.zeros(obs_size), flag, flag)
-    parts = Imagination(signal, learner, example, config, discrete)
+    parts = Imagination(signal, learner, example, config, discrete, step)
     return Behaviour(
         init=functools.partial(init, parts),
         improve=functools.partial(improve, parts),
@@ -239,7 +244,7 @@ def imagine(
         drawn = parts.learner.act(key, actor, normalizer.normalize(normalizers.obs, obs))
         return jnp.where(is_random, uniform_actions(key, obs, drawn.shape[-1], parts.discrete), drawn)
 
-    world = world_of(parts.signal, experience)
+    world = world_of(parts.signal, experience)._replace(step=parts.step)
     start = starts(start_key, experience, config.num_actors, config.current_fraction)
     rows = rollout(rollout_key, act, world, start, config.horizon, config.mover, config.bound)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), rows)

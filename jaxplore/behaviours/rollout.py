@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxplore import normalizer, validate
 from jaxplore.behaviours.base import Experience
 from jaxplore.beliefs.base import Belief
-from jaxplore.dynamics import Normalizers
+from jaxplore.dynamics import Normalizers, Prediction
 from jaxplore.signals.base import Seen, Signal
 from jaxplore.types import Array, Key, Transition
 from jaxplore.validate import FieldError
@@ -30,6 +30,9 @@ class World(NamedTuple):
     """Units of the models."""
     score: Callable[[Seen], Array]
     """`score(seen) -> [N]`: the intrinsic reward of each imagined step."""
+    step: Callable[[Array, Array], Array] | None = None
+    """`step(obs [N, O], action [N, A]) -> next_obs [N, O]`, raw units: where actors go, if a simulator stands in for
+    the models there; what a step is worth is still read off the models. None: a model says."""
 
 
 def world_of(signal: Signal, experience: Experience) -> World:
@@ -57,7 +60,7 @@ def rollout(
     Args:
         key: consumed.
         act: `act(key, obs [N, O]) -> action [N, A]`, on raw observations.
-        world: the belief, models drawn from it, their units and the intrinsic reward.
+        world: the belief, models drawn from it, their units, the intrinsic reward, and perhaps a simulator.
         start: where each actor starts, `[N, O]`.
         horizon: steps, `H`.
         mover: which model moves an actor.
@@ -83,7 +86,7 @@ def rollout(
         >>> imagined.next_obs.shape
         (5, 16, 2)
     """
-    belief, models, normalizers, score = world
+    belief, models, normalizers, score, simulate = world
     validate.one_of("mover", mover, get_args(Mover))
     validate.at_least("horizon", horizon, 1)
     validate.in_range("bound", bound, 0.0)
@@ -97,23 +100,36 @@ def rollout(
         act_key, mover_key = jax.random.split(step_key)
         action = act(act_key, obs)
         prediction = belief.imagine(models, normalizers, obs, action)
-        num_models = prediction.mean.shape[0]
-        if mover == "mean":
-            delta = jnp.mean(prediction.mean, axis=0)
+        if simulate is None:
+            delta = _change(mover_key, prediction, mover, members)
+            delta, next_obs = _arrive(belief, normalizers, obs, delta, bound)
         else:
-            chosen = members if mover == "per_rollout" else jax.random.randint(mover_key, (num_actors,), 0, num_models)
-            delta = prediction.mean[chosen, jnp.arange(num_actors)]
-            if prediction.var is not None:
-                std = jnp.sqrt(prediction.var[chosen, jnp.arange(num_actors)])
-                delta = delta + std * jax.random.normal(jax.random.fold_in(mover_key, 1), delta.shape)
-        if bound:
-            delta = jnp.clip(delta, -bound, bound)
-        next_obs = belief.encoding.next_obs(normalizers, obs, delta)
-        if bound:
-            seen = normalizer.normalize(normalizers.obs, next_obs, limit=None)
-            next_obs = normalizer.denormalize(normalizers.obs, jnp.clip(seen, -bound, bound))
+            next_obs = simulate(obs, action)
+            delta = belief.encoding.targets(normalizers, obs, next_obs)
         never = jnp.zeros(num_actors, bool)
         row = Transition(obs, action, jnp.zeros(num_actors), next_obs, never, never)
         return next_obs, row._replace(reward=score(Seen(row, prediction, delta, normalizers)))
 
     return jax.lax.scan(step, start, jax.random.split(scan_key, horizon))[1]
+
+
+def _change(key: Key, prediction: Prediction, mover: Mover, members: Array) -> Array:
+    """The change `[N, O]` that `mover` takes from what all models predict."""
+    if mover == "mean":
+        return jnp.mean(prediction.mean, axis=0)
+    num_models, num_actors = prediction.mean.shape[:2]
+    chosen = members if mover == "per_rollout" else jax.random.randint(key, (num_actors,), 0, num_models)
+    delta = prediction.mean[chosen, jnp.arange(num_actors)]
+    if prediction.var is None:
+        return delta
+    std = jnp.sqrt(prediction.var[chosen, jnp.arange(num_actors)])
+    return delta + std * jax.random.normal(jax.random.fold_in(key, 1), delta.shape)
+
+
+def _arrive(belief: Belief, normalizers: Normalizers, obs: Array, delta: Array, bound: float) -> tuple[Array, Array]:
+    """`(delta, next_obs)` within the bound, if there is one."""
+    if not bound:
+        return delta, belief.encoding.next_obs(normalizers, obs, delta)
+    delta = jnp.clip(delta, -bound, bound)
+    seen = normalizer.normalize(normalizers.obs, belief.encoding.next_obs(normalizers, obs, delta), limit=None)
+    return delta, normalizer.denormalize(normalizers.obs, jnp.clip(seen, -bound, bound))

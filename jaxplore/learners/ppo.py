@@ -26,7 +26,8 @@ from jaxplore.validate import Checks
 @dataclass(frozen=True)
 class PPOConfig:
     """Settings of PPO. The defaults are the usual ones for MuJoCo; steps between updates, passes over them and weights
-    of the two streams are Burda et al.'s: in 10,000 steps the usual 2,048 would leave room for four updates."""
+    of the two streams are Burda et al.'s: in 10,000 steps the usual 2,048 would leave room for four updates.
+    """
 
     hidden: tuple[int, ...] = (256, 256)
     """Hidden widths of policy and values."""

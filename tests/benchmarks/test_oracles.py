@@ -3,6 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import envs
 from envs import ant_maze
 from jaxplore import METHODS, Replay, Seen, Transition, dynamics
 
@@ -42,3 +43,20 @@ def test_rarity_counts_the_rows_held(oracles):
 def test_squares_cover_the_maze(oracles):
     corners = at((-1, -1), (4.99, 4.99), (-3, 9))
     assert jax.device_get(oracles.square_of(corners)).tolist() == [0, 143, 11]
+
+
+def test_the_simulator_is_the_environment(oracles):
+    # from any state of a random walk, observed in float32
+    env = envs.make("acrobot")
+    reset, step = jax.jit(env.reset), jax.jit(env.step)
+    state = reset(jax.random.key(0))
+    before, actions, after = [], [], []
+    for i in range(60):
+        action = jax.random.uniform(jax.random.key(i), (1,), minval=-1.0, maxval=1.0)
+        before.append(state.obs)
+        state, _ = step(state, action)
+        actions.append(action)
+        after.append(state.obs)
+    got = jax.jit(oracles.step_acrobot)(jnp.stack(before), jnp.stack(actions))
+    np.testing.assert_allclose(got, np.stack(after), atol=1e-4)
+    assert np.ptp(np.stack(after)[:, 0]) > 0.01, "it moved"

@@ -211,3 +211,22 @@ def test_jit_changes_nothing(mover):
         stepped = imagine(mover)
     for a, b in zip(compiled, stepped, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+
+
+@jax.jit
+def simulated(key, models, start):
+    world = world_of(models)._replace(step=lambda obs, action: obs[:, ::-1] + jnp.sum(action, axis=1, keepdims=True))
+    return rollout(key, act, world, start, H, bound=0.1)
+
+
+def test_a_simulator_moves_the_actors_and_the_models_say_what_it_is_worth():
+    rows = jax.device_get(simulated(jax.random.key(0), MODELS, START))
+    np.testing.assert_array_equal(rows.obs[0], START)
+    np.testing.assert_array_equal(rows.obs[1:], rows.next_obs[:-1])
+    # what happened is where it went, and no bound is set to that
+    went = rows.obs[..., ::-1] + np.sum(rows.action, axis=-1, keepdims=True)
+    np.testing.assert_allclose(rows.next_obs, went, rtol=1e-6)
+    for h, n in np.ndindex(rows.reward.shape):
+        predicted = by_hand(rows.obs[h, n], rows.action[h, n])[0]
+        happened = (rows.next_obs[h, n] - rows.obs[h, n] - MEANS["delta"]) / STDS["delta"]
+        assert rows.reward[h, n] == pytest.approx(np.sum(predicted[:, 0]) + 10 * happened[0], rel=1e-3, abs=1e-3)
