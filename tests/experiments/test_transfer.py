@@ -12,6 +12,7 @@ import pytest
 
 import envs
 from experiments import run
+from experiments.runs.command import parse
 from experiments.runs.directory import RunDirectory
 from experiments.runs.spec import RunRef
 from experiments.runs.status import Status
@@ -248,21 +249,48 @@ def test_a_parent_that_diverged_is_refused(explored: Path, tmp_path: Path, capsy
         assert not (tmp_path / "run").exists()
     # its other seed, and what came before, are whole
     env = build.make_env(RunDirectory(half).config())
-    child = build.make_agent(_sac(explored), env)
-    assert parent.resolve(RunRef(str(half)), env, child, _sac(explored)).step == 81
+    config = child_of(explored)
+    assert parent.resolve(RunRef(str(half)), env, build.make_agent(config, env), config).step == 81
 
 
-def _sac(explored: Path):
-    from experiments.run import inherited
-    from experiments.runs.command import parse
+def child_of(ref: Path | str, *words: str):
+    """The configuration of a run of `LEARN`, changed by `words`, and what its parent decides on."""
+    words = (*LEARN, *words, f"--parent={ref}")
+    return run.inherited(parse(words)[1], words).config
 
-    words = [*LEARN, f"--parent={explored}"]
-    return inherited(parse(words)[1], words).config
+
+def agent_of(config):
+    return build.make_agent(config, build.make_env(config))
+
+
+def test_a_policy_by_gradient_ascent_is_handed_on_with_its_form(tmp_path: Path, capsys):
+    climbed, method = tmp_path / "climbed", "disagreement_grad"
+    form = ("--gradient.activation=tanh", "--gradient.log-std-max=1", "--gradient.no-act-greedily")
+    assert run.main(["--env=task", f"--method={method}", *tiny_flags(method), *form, f"--out={climbed}"]) == 0
+    capsys.readouterr()
+    config = child_of(climbed)
+    sac = config.explorer.task_sac
+    found = (sac.hidden, sac.activation, sac.log_std_map, sac.log_std_min, sac.log_std_max)
+    assert found == ((8,), "tanh", "tanh", -5.0, 1.0)
+    (theirs, state), own = explorer_of(climbed), agent_of(config)
+    adopted = own.adopt(own.init(jax.random.key(0)), theirs.actor(state))
+    obs, key = jax.random.normal(jax.random.key(3), (64, 4)), jax.random.key(1)
+    drawn, expected = (
+        jax.jit(agent.act)(key, agent.actor(one), obs) for agent, one in ((own, adopted), (theirs, state))
+    )
+    np.testing.assert_array_equal(drawn, expected)
+    for flag, message in (
+        ("--task-sac.activation=relu", "task_sac.activation='tanh', not 'relu'"),
+        ("--task-sac.log-std-max=2", "task_sac.log_std_max=1.0, not 2.0"),
+        ("--task-sac.log-std-map=clip", "task_sac.log_std_map='tanh', not 'clip'"),
+    ):
+        assert run.main([*LEARN, flag, f"--parent={climbed}", f"--out={tmp_path / 'run'}"]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"has a policy of another form ({message})" in line
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_run_is_given_a_replay_that_holds_all_its_steps():
-    from experiments.runs.command import parse
-
     capacity = lambda *words: parse(["--method=random", *words])[1].config.explorer.data_capacity  # noqa: E731
     assert capacity() == capacity("--steps=9000") == 10_001
     assert capacity("--steps=20000") == 20_001
