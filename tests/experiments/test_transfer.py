@@ -290,6 +290,22 @@ def test_a_policy_by_gradient_ascent_is_handed_on_with_its_form(tmp_path: Path, 
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.parametrize("method", ["maxinfo", "maxinfo_implicit", "rnd_sac"])
+def test_whatever_method_has_a_policy_that_lasts_takes_one_over(method: str, explored: Path):
+    words = [word for word in LEARN if "sac" not in word and "model-free" not in word]
+    words = [*words, f"--method={method}", f"--parent={explored}"]
+    config = run.inherited(parse(words)[1], words).config
+    (theirs, state), own = explorer_of(explored), agent_of(config)
+    assert own.adopt is not None
+    adopted = own.adopt(own.init(jax.random.key(0)), theirs.actor(state))
+    obs = jax.random.normal(jax.random.key(3), (64, 4))
+    mine, its = (
+        jax.jit(agent.act_greedily)(jax.random.key(1), agent.actor(one), obs)
+        for agent, one in ((own, adopted), (theirs, state))
+    )
+    np.testing.assert_array_equal(mine, its)
+
+
 def test_a_run_is_given_a_replay_that_holds_all_its_steps():
     capacity = lambda *words: parse(["--method=random", *words])[1].config.explorer.data_capacity  # noqa: E731
     assert capacity() == capacity("--steps=9000") == 10_001
