@@ -1,6 +1,7 @@
 """`python -m experiments.compare [NAME=]RUN ... --out=DIR`: methods side by side, over the seeds of all their runs.
 
-Runs of one method with different settings are kept apart by a name of your own in front: `"hot=runs/a"`.
+Runs of one method with different settings are kept apart by a name of your own in front: `"hot=runs/a"`. In place of a
+run, a file that `python -m benchmarks.peers.returns` wrote has another library's returns beside ours.
 """
 
 import argparse
@@ -17,7 +18,7 @@ from experiments.analysis.load import columns
 from experiments.runs import modules
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError, disk_error
-from experiments.runs.files import replacing
+from experiments.runs.files import replacing, write_text
 from experiments.runs.seeds import expand
 
 
@@ -49,7 +50,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Print tables, write pictures and `comparison.json`; the exit status is 0, or 1 with a message."""
     parser = argparse.ArgumentParser(prog="python -m experiments.compare", description=__doc__)
     parser.add_argument(
-        "runs", nargs="+", metavar="[NAME=]RUN", help="directories of finished runs, grouped by NAME, or by method"
+        "runs",
+        nargs="+",
+        metavar="[NAME=]RUN",
+        help="directories of finished runs, grouped by NAME, or by method; and files of other libraries' returns, as "
+        "benchmarks.peers.returns writes them, by NAME, or by library",
     )
     parser.add_argument("--out", type=Path, required=True, help="directory for the pictures and comparison.json")
     parser.add_argument("--until", type=int, help="compare the first so many steps of each run (default: all)")
@@ -67,15 +72,21 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser.error(f"--until={arguments.until}. Allowed: 1 or more.")
     try:
         modules.load(arguments.imports)
-        pairs = map(split_name, arguments.runs)
-        names, runs = zip(*((name, run) for name, path in pairs for run in expand(path)), strict=True)
-        text = comparison.write(runs, names, arguments.out, arguments.until, arguments.against)
+        pairs = [split_name(word) for word in arguments.runs]
+        others = [(name, path) for name, path in pairs if path.is_file()]
+        ours = [(name, run) for name, path in pairs if not path.is_file() for run in expand(path)]
+        if not ours:
+            raise RunError(f"{others[0][1]}: is of another library. Give at least one run to hold it beside.")
+        names, runs = zip(*ours, strict=True)
+        text = comparison.write(runs, names, arguments.out, arguments.until, arguments.against, others)
         if arguments.csv:
             write_csv(arguments.csv, columns(runs, names, arguments.until))
         if arguments.keep:
             try:
                 for run in runs:
                     RunDirectory(run).keep(arguments.keep)
+                for _, path in others:
+                    write_text(arguments.keep / path.name, path.read_text())
             except OSError as error:
                 raise disk_error("keep the runs", arguments.keep, error) from error
         print(text)

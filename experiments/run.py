@@ -17,6 +17,7 @@ from experiments.runs.config import RunConfig, check_room, flag, path_of
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError
 from experiments.runs.inherit import inherit
+from experiments.runs.schedule import on_schedule
 from experiments.runs.seeds import SeedRuns
 from experiments.runs.spec import RunSpec
 from experiments.runs.status import Status
@@ -55,6 +56,8 @@ def main(argv: Sequence[str] | None = None, *, is_command: bool = False) -> int:
             check_read(argv, spec.config, build.sizes_of(env))
             split = seeds.are_split(command, spec, env, is_command=is_command)
             chosen = place.choose(command.out, spec, resume=command.resume)
+            if resumes and starts_over(chosen, spec):
+                with_parent(spec, env, agent)
             ready = (
                 seeds.plan(command, spec, env, agent)
                 if split
@@ -94,25 +97,52 @@ def inherited(spec: RunSpec, argv: Sequence[str]) -> RunSpec:
 def prepare(spec: RunSpec, *, resume: bool) -> tuple[Environment, Explorer, RunSpec]:
     """Environment and agent, which refuse what they cannot do when they are built: before anything is written.
 
-    A run that is resumed has its parent's policy in its checkpoints. What each seed takes of several seeds' runs is
-    found out by `seeds.plan`.
+    A run that is resumed has its parent's policy in its checkpoints, if it has any (`starts_over`). What each seed
+    takes of several seeds' runs is found out by `seeds.plan`.
 
     Returns:
         Them, and the specification with the physics engine that was chosen, so that another machine takes the same.
 
     Raises:
         ValueError: what is refused, by its flag.
+        RunError: the parent's files cannot be read, or its checkpoint is damaged.
     """
     try:
         env = build.make_env(spec.config)
         spec = dataclasses.replace(spec, config=dataclasses.replace(spec.config, backend=env.backend))
         agent = build.make_agent(spec.config, env)
-        if spec.parent is not None and not resume and not SeedRuns(spec.parent.directory).exists():
-            spec = dataclasses.replace(spec, parent=parent.resolve(spec.parent, env, agent, spec.config))
-        return env, agent, spec
     except FieldError as error:
-        path = "parent" if error.field == "parent" else path_of(spec.config, error)
+        path = path_of(spec.config, error)
         raise ValueError(error.spell(flag(path)) if path else str(error)) from error
+    if spec.parent is not None and not resume:
+        spec = with_parent(spec, env, agent)
+    return env, agent, spec
+
+
+def with_parent(spec: RunSpec, env: Environment, agent: Explorer) -> RunSpec:
+    """The specification with all that is known of its parent, which is checked; of several seeds' runs, which they are.
+
+    Raises:
+        ValueError: the parent is refused, or is no longer the run that was started from.
+        RunError: its files cannot be read, or its checkpoint is damaged.
+    """
+    assert spec.parent is not None
+    found = SeedRuns(spec.parent.directory)
+    try:
+        if found.exists():
+            parent.check_recorded(spec.parent, found.spec().identity)
+            return spec
+        return dataclasses.replace(spec, parent=parent.resolve(spec.parent, env, agent, spec.config))
+    except FieldError as error:
+        raise ValueError(error.spell(flag("parent"))) from error
+
+
+def starts_over(directory: RunDirectory, spec: RunSpec) -> bool:
+    """Whether a run that is resumed has no checkpoint to continue from, and so needs its parent once more."""
+    if spec.parent is None or directory.status() is Status.ABSENT:
+        return False
+    is_open = directory.status() is Status.PARTIAL or place.lengthens(directory, spec)
+    return is_open and on_schedule(spec.config, directory.checkpoints().steps()) is None
 
 
 def make_programs_that_fit(config: RunConfig, env: Environment, agent: Explorer, *, resume: bool) -> Programs:

@@ -12,6 +12,8 @@ import pytest
 
 import envs
 import jaxplore
+from jaxplore.config import ExplorationConfig, Sizes
+from jaxplore.exploration import make_explorer
 from jaxplore.methods import METHODS
 
 ROOT = Path(__file__).parent.parent
@@ -73,6 +75,17 @@ def test_a_method_of_your_own_takes_25_lines_and_runs(tmp_path: Path, monkeypatc
 
 def test_every_method_is_in_the_table():
     assert sorted(first_column(section("Methods"))) == sorted(METHODS)
+
+
+def test_the_row_on_parents_names_whose_policy_can_be_taken_over():
+    def takes_over(name: str) -> bool:
+        # a task in numbers, and what compiles nothing
+        method, sizes = METHODS[name], Sizes(3, 1, has_reward=True)
+        return method.fits(sizes) and make_explorer(method, sizes, ExplorationConfig()).adopt is not None
+
+    (row,) = [line for line in README.splitlines() if line.startswith("| `run --parent=")]
+    (names,) = re.findall(r"lasts as long as the run: ([^.]*)\.", row)
+    assert sorted(re.findall(r"`(\w+)`", names)) == sorted(filter(takes_over, METHODS))
 
 
 def test_every_environment_is_in_the_table():

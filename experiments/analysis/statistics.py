@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from experiments.analysis.intervals import Paired, paired
 from experiments.analysis.load import LoadedRun, held, load, series
 from experiments.runs.errors import RunError
 
@@ -62,6 +63,59 @@ class Group(NamedTuple):
         """Seed -> mean height of its coverage curve, 0 to 1."""
         means = self.coverage.mean(axis=1).tolist()
         return {outcome.seed: mean for outcome, mean in zip(self.outcomes, means, strict=True)}
+
+
+class Returns(NamedTuple):
+    """What evaluations of one method, or of another library, earned."""
+
+    label: str
+    seeds: tuple[int, ...]
+    steps: np.ndarray
+    """`[E]`, those of parents included; empty where a seed has none."""
+    values: np.ndarray
+    """`[S, E]`"""
+
+
+class PairedReturns(NamedTuple):
+    """One method's returns against another's on the seeds that both have."""
+
+    first: int
+    """The first step at which both had been evaluated: one that starts from a parent begins later."""
+    last: int
+    """The last one."""
+    final: Paired
+    """At the last step."""
+    mean: Paired
+    """Mean over the evaluations from first to last: the area under the curve, over its length."""
+
+
+def returns_of(group: Group) -> Returns:
+    """The evaluations of a group."""
+    return Returns(group.label, tuple(one.seed for one in group.outcomes), group.evaluated, group.returns)
+
+
+def paired_returns(one: Returns, other: Returns) -> PairedReturns | None:
+    """Returns compared seed by seed over the steps that both have; None where there are none, or no seed is in both.
+
+    Where one was evaluated and the other was not, a straight line between its evaluations stands for it: runs with
+    parents of 2,000 steps are evaluated at other steps than those without.
+    """
+    if not len(one.steps) or not len(other.steps):
+        return None
+    first, last = max(one.steps[0], other.steps[0]), min(one.steps[-1], other.steps[-1])
+    steps = np.union1d(one.steps, other.steps)
+    steps = steps[(steps >= first) & (steps <= last)]
+    if not len(steps):
+        return None
+    own, others = (
+        {seed: np.interp(steps, of.steps, line) for seed, line in zip(of.seeds, of.values, strict=True)}
+        for of in (one, other)
+    )
+    final, mean = (
+        paired(*({seed: float(part(line)) for seed, line in lines.items()} for lines in (own, others)))
+        for part in (lambda line: line[-1], np.mean)
+    )
+    return PairedReturns(int(first), int(last), final, mean) if final and mean else None
 
 
 def outcomes(run: LoadedRun) -> list[Outcome]:

@@ -81,6 +81,22 @@ class Checkpoints:
         except OSError as error:
             raise disk_error("look for checkpoints", self.directory, error) from error
 
+    def check(self, step: int) -> dict[str, Any]:
+        """The meta of the checkpoint of a step, every byte of which is found to be as it was saved.
+
+        Raises:
+            RunError: it is damaged; names the steps of those that are whole.
+        """
+        path = self.directory / str(step)
+        try:
+            return _verify(path)["meta"]
+        except _Damaged as damage:
+            whole = [str(other) for other in self.steps() if other != step and _is_whole(self.directory / str(other))]
+            others = f", or take another one: whole are those of step {', '.join(whole)}" if whole else ""
+            raise RunError(
+                f"the checkpoint {path} is damaged ({damage}). What to do: put back a copy of it{others}."
+            ) from None
+
     def save(self, step: int, state: Any, meta: dict[str, Any] | None = None) -> None:
         """Saves a state; when this returns it is on the disk, and the `keep` newest checkpoints are all that is left,
         beside those of `keep_at`.
@@ -240,6 +256,14 @@ def _verify(path: Path) -> dict[str, Any]:
     if manifest["format"] != _FORMAT or str(manifest["step"]) != path.name:
         raise _Damaged("manifest.json is of another checkpoint or another version")
     return manifest
+
+
+def _is_whole(path: Path) -> bool:
+    try:
+        _verify(path)
+    except _Damaged:
+        return False
+    return True
 
 
 def _signed(manifest: dict[str, Any]) -> bytes:

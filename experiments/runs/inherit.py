@@ -11,11 +11,13 @@ from experiments.runs.config import RunConfig, replace
 from experiments.runs.spec import RunSpec
 from experiments.runs.status import Status
 from jaxplore.methods import METHODS
+from jaxplore.networks import TanhGaussianPolicy
 
 NETWORK = ("hidden", "activation", "log_std_map", "log_std_min", "log_std_max")
 """Settings of SAC that decide on what its policy's parameters mean."""
-LEARNERS = ("task_sac", "sac")
-"""Groups of the explorer that describe a policy which can be handed on."""
+LEARNERS = ("task_sac", "sac", "gradient")
+"""Groups of the explorer that describe a policy which can be handed on. Gradient ascent's is the same network as SAC's,
+without a choice of `log_std_map`."""
 
 
 def form_of(config: RunConfig) -> dict[str, Any]:
@@ -28,7 +30,8 @@ def form_of(config: RunConfig) -> dict[str, Any]:
     learner = getattr(config.explorer, group)
     lasting = "model_free" in METHODS[config.method].reads(config.explorer)
     seen = config.explorer.model_free.normalize_obs if lasting else True
-    return {**{name: getattr(learner, name) for name in NETWORK}, "normalize_obs": seen}
+    fixed = {"log_std_map": TanhGaussianPolicy.log_std_map}
+    return {**fixed, **{name: getattr(learner, name) for name in _names(learner)}, "normalize_obs": seen}
 
 
 def paths_of_form(config: RunConfig) -> dict[str, str]:
@@ -38,9 +41,14 @@ def paths_of_form(config: RunConfig) -> dict[str, str]:
     group = _learner(config)
     if group is None:
         return {}
-    paths = {name: f"{group}.{name}" for name in NETWORK}
+    paths = {name: f"{group}.{name}" for name in _names(getattr(config.explorer, group))}
     lasting = "model_free" in METHODS[config.method].reads(config.explorer)
     return {**paths, "normalize_obs": "model_free.normalize_obs"} if lasting else paths
+
+
+def _names(learner: Any) -> list[str]:
+    """Which of `NETWORK` can be chosen."""
+    return [name for name in NETWORK if hasattr(learner, name)]
 
 
 def _learner(config: RunConfig) -> str | None:

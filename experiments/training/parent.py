@@ -1,6 +1,8 @@
 """Runs that start from another run's policy."""
 
 import dataclasses
+import re
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +10,7 @@ import jax.numpy as jnp
 from envs.base import Environment
 from experiments.runs.config import RunConfig, flag
 from experiments.runs.directory import RunDirectory
+from experiments.runs.errors import RunError
 from experiments.runs.inherit import conflicts
 from experiments.runs.spec import RunRef
 from experiments.runs.status import Status
@@ -33,8 +36,9 @@ def resolve(ref: RunRef, env: Environment, agent: Explorer, config: RunConfig) -
 
     Raises:
         FieldError: it is no run, has no such checkpoint, is not finished (unless a checkpoint is named), has diverged,
-            or is of other sizes or another form; or the new agent has no policy to start with.
-        RunError: its files cannot be read.
+            is of another environment, other sizes or another form, or is not the run whose identity the reference has;
+            or the new agent has no policy to start with.
+        RunError: its files cannot be read, or its checkpoint is damaged.
     """
     directory = RunDirectory(ref.directory)
     if agent.adopt is None:
@@ -59,6 +63,8 @@ def resolve(ref: RunRef, env: Environment, agent: Explorer, config: RunConfig) -
     if own != other:
         allowed = f"a run with {own[0]} observation entries and {own[1]} action entries"
         raise FieldError("parent", str(ref), allowed, f"has {other[0]} and {other[1]}")
+    if config.env != spec.config.env:
+        _check_entries(ref, (config.env, env), (spec.config.env, parent_env))
     _check_form(ref, config, spec.config)
     parent_agent = build.make_agent(spec.config, parent_env)
     here, there = (jax.tree.map(_shape, _abstract_actor(one).behaviour) for one in (agent, parent_agent))
@@ -66,7 +72,53 @@ def resolve(ref: RunRef, env: Environment, agent: Explorer, config: RunConfig) -
         allowed = "a run whose method has a policy of SAC's, such as implicit, max, icm or sac"
         raise FieldError("parent", str(ref), allowed, f"has another kind of policy (method {spec.config.method!r})")
     _check_alive(ref, directory, step, config)
+    check_identity(ref, directory, step)
     return RunRef(ref.directory, step, spec.identity, spec.parent.steps if spec.parent else 0)
+
+
+def check_identity(ref: RunRef, directory: RunDirectory, step: int) -> None:
+    """The parent is the run that the reference says, if it says any, and its checkpoint is as it was saved.
+
+    Raises:
+        FieldError: it is another run.
+        RunError: its files cannot be read, or the checkpoint is damaged.
+    """
+    try:
+        saved = directory.checkpoints().check(step)
+    except RunError as error:
+        raise RunError(f"--parent={ref}: {error}") from error
+    # One that has been made longer since is another run, and its checkpoint of before the same.
+    if saved.get("identity") != ref.identity:
+        check_recorded(ref, directory.spec().identity)
+
+
+def check_recorded(ref: RunRef, identity: str) -> None:
+    """Raise `FieldError` unless the reference has this identity, or none."""
+    if ref.identity not in ("", identity):
+        allowed = "that run, back in its place, or a new run that starts from this one"
+        problem = f"is another run by now: its identity is {identity}, and that of the one started from {ref.identity}"
+        raise FieldError("parent", str(ref), allowed, problem)
+
+
+def _check_entries(ref: RunRef, own: tuple[str, Environment], parent: tuple[str, Environment]) -> None:
+    """Two environments of the same sizes have the same entries, as far as their names say."""
+    for kind in ("observation", "action"):
+        here, there = (_names(env, kind) for _, env in (own, parent))
+        if here == there and not _are_numbered(here):
+            continue
+        pairs = enumerate(zip(here, there, strict=True))
+        told = next((f"entry {i} is {b!r}, not {a!r}" for i, (a, b) in pairs if a != b), "entries are only numbered")
+        allowed = f"a run of {own[0]}, or of an environment whose entries have the same names"
+        raise FieldError("parent", str(ref), allowed, f"is of another environment, {parent[0]}, whose {kind} {told}")
+
+
+def _names(env: Environment, kind: str) -> Sequence[str]:
+    return env.spec.obs_names if kind == "observation" else env.spec.action_names
+
+
+def _are_numbered(names: Sequence[str]) -> bool:
+    """Whether names say nothing of what entries are, as other packages' environments have it: `obs[0]`, `action=1`."""
+    return all(re.search(r"\d\]?$", name) for name in names)
 
 
 def _check_form(ref: RunRef, own: RunConfig, parent: RunConfig) -> None:
@@ -101,8 +153,18 @@ def _shape(leaf: jax.ShapeDtypeStruct) -> tuple[tuple[int, ...], str]:
 def adopt(state: RunState, ref: RunRef, agent: Explorer) -> RunState:
     """The state that a run starts from, with the policies of its parent: of the seed with the same place in it, and
     of its only seed where it has one.
+
+    Args:
+        state: of the new run.
+        ref: the parent, as `resolve` gives it.
+        agent: of the new run.
+
+    Raises:
+        RunError: the checkpoint cannot be read, or is damaged: no other one takes its place.
     """
+    assert ref.step is not None
     directory = RunDirectory(ref.directory)
+    directory.checkpoints().check(ref.step)
     config = directory.config()
     env = build.make_env(dataclasses.replace(config, eval_every=0))
     parent_agent = build.make_agent(config, env)

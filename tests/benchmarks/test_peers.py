@@ -12,6 +12,7 @@ from benchmarks import flops, peers, run
 from benchmarks.peers import common, ensemble, returns, sac, search, vector
 from benchmarks.peers.common import Line
 from benchmarks.timing import Pairs, measure_pairs
+from experiments.analysis.peers import read as read_peer
 from experiments.runs.presets import preset_config
 from jaxplore import MCTSConfig, SACConfig, rewards
 from jaxplore.behaviours.mcts import make_mcts
@@ -250,6 +251,10 @@ def test_a_whole_run_of_a_peer_is_evaluated_as_ours_are(monkeypatch, tmp_path):
     # A cheetah that does nothing stays where it is, but for how it lands.
     assert all(abs(row["return"]) < 50 for row in stored["rows"])
     assert stored["rows"][0]["return_std"] > 0
+    # and is read back to stand beside ours
+    peer = read_peer(out)
+    assert (peer.library, peer.version, peer.seed, peer.steps) == ("sbx", "1.0", 0, (10, 20, 25))
+    assert list(peer.returns) == [row["return"] for row in stored["rows"]]
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from experiments import compare
-from experiments.analysis import intervals, statistics
+from experiments.analysis import comparison, intervals, statistics
 from experiments.analysis.load import columns
 from experiments.runs import schedule
 from experiments.runs.directory import RunDirectory
@@ -19,10 +19,12 @@ from experiments.runs.spec import RunRef, RunSpec, to_json
 from tests.experiments.tiny import ROOT
 
 
-def write_run(path: Path, method: str, seed: int, reached: list[int], steps: int = 1_000) -> Path:
+def write_run(
+    path: Path, method: str, seed: int, reached: list[int], steps: int = 1_000, env: str = "ant_maze"
+) -> Path:
     """A finished run that sees its cells at the given steps."""
     path.mkdir()
-    config = dataclasses.replace(preset_config("laptop"), method=method, seed=seed, steps=steps)
+    config = dataclasses.replace(preset_config("laptop"), method=method, seed=seed, steps=steps, env=env)
     (path / "config.json").write_text(to_json(RunSpec(config)))
     rows = []
     for _, step in schedule.rounds(config, 0):
@@ -239,9 +241,11 @@ def test_columns_have_nothing_where_a_row_has_none(runs: list[Path]):
     assert variance[0] == 0.5 and np.isnan(variance[1:]).all()
 
 
-def write_evaluated(path: Path, seed: int, returns: dict[int, float], steps: int, parent: RunRef | None = None) -> Path:
+def write_evaluated(
+    path: Path, seed: int, returns: dict[int, float], steps: int, parent: RunRef | None = None, env: str = "ant_maze"
+) -> Path:
     """A finished run whose own steps have evaluations."""
-    run = write_run(path, "implicit", seed, [25], steps)
+    run = write_run(path, "implicit", seed, [25], steps, env)
     spec = RunSpec(RunDirectory(run).config(), parent)
     (run / "config.json").write_text(to_json(spec))
     told = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
@@ -263,6 +267,19 @@ def test_returns_count_the_steps_of_parents(tmp_path: Path, capsys: pytest.Captu
     # half-width: t(1, 0.975) = 12.706 times std / sqrt(2): 12.706 * 2 and 12.706 * 0.5
     assert "| `plain` | 2 | 12.0 +- 25.4 | 10.0, 14.0 | 1,000 |" in text
     assert "| `moved` | 2 | 20.5 +- 6.4 | 20.0, 21.0 | 1,000 |" in text
+    # at the end 10 and 7 more; on average, both from 500 on, 11 - 5 and 11.5 - 7.5
+    assert "| `moved` | 500 to 1,000 | +8.5 +- 19.1 | 2 of 2 | +5.0 +- 12.7 | 2 of 2 |" in text
+    assert "| final return less `plain`, by seed: mean, 95 % | seeds ahead of `plain` |" in text
+    record = json.loads((tmp_path / "out" / "comparison.json").read_text())["returns"]
+    assert record["less"] == "plain" and list(record["by_name"]) == ["moved"]
+    moved_by = record["by_name"]["moved"]
+    assert (moved_by["first"], moved_by["last"]) == (500, 1_000)
+    assert moved_by["final"] == {
+        "seeds": [0, 1],
+        "difference": {"mean": 8.5, "half_width": pytest.approx(1.5 * 12.7062, rel=1e-5)},
+        "ahead": 2.0,
+    }
+    assert moved_by["mean"]["difference"]["mean"] == 5.0
     assert (tmp_path / "out" / "return.png").stat().st_size > 10_000
     _, (own, after) = statistics.group([*plain, *moved], names=["plain"] * 2 + ["moved"] * 2)
     assert own.evaluated.tolist() == [500, 1_000] and after.evaluated.tolist() == [500, 1_000]
@@ -285,3 +302,112 @@ def test_without_evaluations_there_is_no_picture_of_returns(runs: list[Path], tm
     assert compare.main([*map(str, runs), f"--out={tmp_path / 'out'}"]) == 0
     assert "final return" not in capsys.readouterr().out
     assert not (tmp_path / "out" / "return.png").exists()
+
+
+def write_peer(path: Path, seed: int, returns: dict[int, float], /, **changes) -> Path:
+    """A run of another library, as `benchmarks.peers.returns` writes it; what is changed to None is left out."""
+    rows = [{"env_steps": step, "return": value, "return_std": 1.0, "seconds": 9.5} for step, value in returns.items()]
+    who = {"library": "sbx", "version": "0.2", "environment": "HalfCheetah-v5", "seed": seed, "warm_up_steps": 100}
+    data = {name: value for name, value in {**who, "rows": rows, **changes}.items() if value is not None}
+    path.write_text(json.dumps(data))
+    return path
+
+
+@pytest.fixture
+def cheetahs(tmp_path: Path) -> list[str]:
+    """Two seeds of a method of 1,000 steps on the half cheetah."""
+    returns = {500: 10.0, 1_000: 20.0}
+    runs = [write_evaluated(tmp_path / f"r{i}", i, returns, 1_000, env="half_cheetah_task") for i in range(2)]
+    return [str(run) for run in runs]
+
+
+def test_another_librarys_returns_stand_beside_ours(cheetahs: list[str], tmp_path: Path, capsys):
+    # what comes after the runs' 1,000 steps is left out
+    peers = [
+        write_peer(tmp_path / f"p{i}.json", i, {500: 11.0 + i, 1_000: 24.0 + 2 * i, 1_500: 99.0}) for i in range(2)
+    ]
+    out = tmp_path / "out"
+    assert (
+        compare.main([*cheetahs, *map(str, peers), f"own={peers[0]}", f"--out={out}", f"--keep={tmp_path / 'k'}"]) == 0
+    )
+    text = capsys.readouterr().out
+    # half-widths: t(1, 0.975) = 12.706 times 1, and times 0.75
+    assert "| `implicit` | 2 | 20.0 +- 0.0 | 20.0, 20.0 | 1,000 |" in text
+    assert "| `sbx` | 2 | 25.0 +- 12.7 | 24.0, 26.0 | 1,000 |" in text
+    assert "| `own` | 1 | 24.0 | 24.0 | 1,000 |" in text
+    assert "| `sbx` | 500 to 1,000 | +5.0 +- 12.7 | 2 of 2 | +3.2 +- 9.5 | 2 of 2 |" in text
+    assert "| `own` | 500 to 1,000 | +4.0 | 1 of 1 | +2.5 | 1 of 1 |" in text
+    assert text.count("`sbx`") == 2, "it has no coverage, and no belief"
+    record = json.loads((out / "comparison.json").read_text())
+    assert list(record["methods"]) == ["implicit"] and list(record["others"]) == ["sbx", "own"]
+    told = {"library": "sbx", "version": "0.2", "environment": "HalfCheetah-v5", "seed": 1, "warm_up_steps": 100}
+    assert record["others"]["sbx"][1] == {
+        **told,
+        "final_return": 26.0,
+        "evaluated": [500, 1_000],
+        "returns": [12.0, 26.0],
+    }
+    assert record["returns"]["by_name"]["sbx"]["final"]["difference"]["mean"] == 5.0
+    assert (tmp_path / "k" / "p1.json").read_text() == peers[1].read_text()
+    # compared with it; coverage, which it has none of, with the first run's
+    named = [f"ours={cheetahs[0]}", f"theirs={peers[0]}", f"--out={out}", "--against=theirs", "--until=700"]
+    assert compare.main(named) == 0
+    assert "| `ours` | 500 | -1.0 | 0 of 1 | -1.0 | 0 of 1 |" in capsys.readouterr().out
+
+
+def test_another_librarys_returns_are_in_the_picture(cheetahs: list[str], tmp_path: Path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(comparison.figures, "plot_return", lambda path, curves, title: drawn.extend(curves))
+    peers = [write_peer(tmp_path / f"p{i}.json", i, {500: 11.0, 1_000: 24.0 + i}) for i in range(2)]
+    assert compare.main([*cheetahs, *map(str, peers), f"--out={tmp_path / 'out'}"]) == 0
+    assert [curve.label for curve in drawn] == ["implicit", "sbx"]
+    assert drawn[1].steps.tolist() == [500, 1_000] and drawn[1].values.tolist() == [[11.0, 24.0], [11.0, 25.0]]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rows": None}, "holds no run of another library (it has no 'rows'). What to do: give a file that `python -m"),
+        ({"rows": []}, "holds no run of another library (it has no rows)"),
+        ({"library": 7}, "(library is 7)"),
+        ({"seed": "0"}, "(seed is '0')"),
+        ({"rows": [{"env_steps": 500, "return": None}]}, "(return is None)"),
+        ({"rows": [{"env_steps": 500, "return": float("nan")}]}, "(a return is not finite)"),
+        ({"rows": [{"env_steps": n, "return": 1.0} for n in (500, 500)]}, "(env_steps do not rise from row to row)"),
+        (
+            {"environment": "Walker2d-v5"},
+            "is of Walker2d-v5, and the runs of half_cheetah_task. Allowed: gymnasium:Walker2d-v5.",
+        ),
+        (
+            {"rows": [{"env_steps": 900, "return": 1.0}]},
+            "ends at step 900, before step 1000. Compare with --until=900 or",
+        ),
+        (
+            {"rows": [{"env_steps": 1_100, "return": 1.0}]},
+            "was first evaluated at step 1100. Compare with --until=1100",
+        ),
+    ],
+)
+def test_what_is_no_run_of_another_library_is_refused(
+    change: dict, message: str, cheetahs: list[str], tmp_path: Path, capsys
+):
+    path = write_peer(tmp_path / "p.json", 0, {500: 1.0, 1_000: 2.0}, **change)
+    assert compare.main([*cheetahs, str(path), f"--out={tmp_path / 'out'}"]) == 1
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: {path} ") and message in line, line
+    assert not (tmp_path / "out").exists()
+
+
+def test_files_of_other_libraries_that_do_not_go_together_are_refused(cheetahs: list[str], tmp_path: Path, capsys):
+    path, broken = write_peer(tmp_path / "p.json", 0, {500: 1.0, 1_000: 2.0}), tmp_path / "broken.json"
+    broken.write_text("{")
+    for words, message in (
+        ([*cheetahs, str(path), str(path)], "sbx: seed 0 comes twice. Give each once, or NAME=FILE."),
+        ([*cheetahs, f"implicit={path}"], "implicit: is a name of runs and of another library's."),
+        ([str(path)], f"{path}: is of another library. Give at least one run to hold it beside."),
+        ([*cheetahs, str(broken)], f"{broken} holds no run of another library (Expecting property name"),
+    ):
+        assert compare.main([*words, f"--out={tmp_path / 'out'}"]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"error: {message}"), line
+    assert not (tmp_path / "out").exists()

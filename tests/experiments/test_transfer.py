@@ -1,5 +1,6 @@
 """Runs that start from another run's policy: what comes with it, who warms up, and what is refused."""
 
+import dataclasses
 import json
 import re
 import shutil
@@ -12,8 +13,10 @@ import pytest
 
 import envs
 from experiments import run
+from experiments.runs.command import parse
 from experiments.runs.directory import RunDirectory
-from experiments.runs.spec import RunRef
+from experiments.runs.errors import RunError
+from experiments.runs.spec import RunRef, RunSpec, to_json
 from experiments.runs.status import Status
 from experiments.training import build, loop, parent
 from jaxplore.methods import METHODS
@@ -248,21 +251,219 @@ def test_a_parent_that_diverged_is_refused(explored: Path, tmp_path: Path, capsy
         assert not (tmp_path / "run").exists()
     # its other seed, and what came before, are whole
     env = build.make_env(RunDirectory(half).config())
-    child = build.make_agent(_sac(explored), env)
-    assert parent.resolve(RunRef(str(half)), env, child, _sac(explored)).step == 81
+    config = child_of(explored)
+    assert parent.resolve(RunRef(str(half)), env, build.make_agent(config, env), config).step == 81
 
 
-def _sac(explored: Path):
-    from experiments.run import inherited
-    from experiments.runs.command import parse
+def child_of(ref: Path | str, *words: str):
+    """The configuration of a run of `LEARN`, changed by `words`, and what its parent decides on."""
+    words = (*LEARN, *words, f"--parent={ref}")
+    return run.inherited(parse(words)[1], words).config
 
-    words = [*LEARN, f"--parent={explored}"]
-    return inherited(parse(words)[1], words).config
+
+def agent_of(config):
+    return build.make_agent(config, build.make_env(config))
+
+
+def damage(out: Path, step: int) -> Path:
+    """Change a byte of the largest file of a checkpoint, which is given."""
+    checkpoint = out / "checkpoints" / str(step)
+    file = max(
+        (path for path in (checkpoint / "state").rglob("*") if path.is_file()), key=lambda path: path.stat().st_size
+    )
+    held = bytearray(file.read_bytes())
+    held[len(held) // 2] ^= 1
+    file.write_bytes(held)
+    return checkpoint
+
+
+def files(out: Path) -> dict[Path, bytes]:
+    return {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(("at", "whole"), [("@50", "25, 75, 81"), ("", "25, 50, 75")])
+def test_of_a_damaged_checkpoint_no_older_one_takes_the_place(
+    at: str, whole: str, explored: Path, tmp_path: Path, capsys
+):
+    broken = tmp_path / "broken"
+    shutil.copytree(explored, broken)
+    checkpoint = damage(broken, 50 if at else 81)
+    assert run.main([*LEARN, f"--parent={broken}{at}", f"--out={tmp_path / 'child'}"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: --parent={broken}{at}: the checkpoint {checkpoint} is damaged (state/")
+    assert line.endswith(
+        f"altered). What to do: put back a copy of it, or take another one: whole are those of step {whole}."
+    )
+    assert list(tmp_path.iterdir()) == [broken]
+
+
+def test_a_run_that_has_to_start_over_looks_at_its_parent_again(explored: Path, tmp_path: Path, capsys):
+    source, child = tmp_path / "source", tmp_path / "child"
+    shutil.copytree(explored, source)
+    assert run.main([*LEARN, f"--parent={source}@50", f"--out={child}"]) == 0
+    recorded = RunDirectory(child).spec().parent
+    assert recorded is not None and recorded.identity == RunDirectory(source).spec().identity
+    (child / "outcome.json").unlink()
+    shutil.copytree(child, tmp_path / "later")
+    shutil.rmtree(child / "checkpoints")
+    before = files(child)
+    # damaged since: nothing of the child is touched
+    checkpoint = damage(source, 50)
+    capsys.readouterr()
+    assert run.main(["--resume", f"--out={child}"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"the checkpoint {checkpoint} is damaged" in line and files(child) == before
+    with pytest.raises(RunError, match=f"{checkpoint} is damaged"):
+        parent.adopt(None, recorded, None)  # pyright: ignore[reportArgumentType]
+    # another run in its place
+    shutil.rmtree(source)
+    assert run.main([*EXPLORE, "--seed=7", f"--out={source}"]) == 0
+    other = RunDirectory(source).spec().identity
+    capsys.readouterr()
+    for words in (["--resume", f"--out={child}"], [f"--config={child / 'config.json'}", f"--out={tmp_path / 'again'}"]):
+        assert run.main(words) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(
+            f"error: --parent='{source}@50' is another run by now: its identity is {other}, and that"
+        )
+        assert f"of the one started from {recorded.identity}. Allowed: that run, back in its place" in line
+    assert files(child) == before and not (tmp_path / "again").exists()
+    # with a checkpoint of its own it needs no parent
+    shutil.rmtree(source)
+    assert run.main(["--resume", f"--out={tmp_path / 'later'}"]) == 0
+    # made longer it is another run, and what it was at that step the same
+    shutil.copytree(explored, source)
+    spec = RunDirectory(source).spec()
+    RunDirectory(source).extend(dataclasses.replace(spec, config=dataclasses.replace(spec.config, steps=120)))
+    assert RunDirectory(source).spec().identity != recorded.identity
+    assert run.main(["--resume", f"--out={child}"]) == 0
+    assert rows(child) == rows(tmp_path / "later")
+
+
+def test_of_several_seeds_runs_the_record_is_theirs_together(explored: Path, tmp_path: Path, capsys):
+    spec = RunDirectory(explored).spec()
+    for place, identity in (("same", spec.identity), ("other", "0123456789abcdef")):
+        source, config = tmp_path / place, tmp_path / f"{place}.json"
+        source.mkdir()
+        (source / "seeds.json").write_text(to_json(spec))
+        child = RunSpec(child_of(explored), RunRef(str(source), None, identity))
+        config.write_text(to_json(child))
+        # side by side they have one parent: what is refused next
+        assert run.main([f"--config={config}", f"--out={tmp_path / 'run'}"]) == 2
+    same_, other = capsys.readouterr().err.splitlines()
+    assert "holds a run for each of several seeds" in same_
+    assert f"its identity is {spec.identity}, and that of the one started from 0123456789abcdef" in other
+
+
+POINT = make_task_point()
+VARIANTS = {
+    "twin": {},
+    "numbered": {"obs_names": tuple(f"obs[{i}]" for i in range(4))},
+    "numbered_too": {"obs_names": tuple(f"obs[{i}]" for i in range(4))},
+    "turned": {"action_names": ("y push", "x push")},
+    "one_push": {"action_names": ("push",)},
+}
+"""The point with other entries."""
+
+
+@pytest.fixture
+def variants(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, changes in VARIANTS.items():
+        spec = dataclasses.replace(POINT.spec, name=name, **changes)
+        made = dataclasses.replace(POINT, spec=spec)
+        monkeypatch.setitem(envs.FACTORIES, name, lambda backend="auto", obs_noise=0.0, made=made: made)
+
+
+def move(explored: Path, env: str, to: Path) -> Path:
+    """The run as if it had been in another environment."""
+    shutil.copytree(explored, to)
+    spec = RunDirectory(to).spec()
+    config = dataclasses.replace(spec.config, env=env, backend="auto")
+    (to / "config.json").write_text(to_json(dataclasses.replace(spec, config=config)))
+    return to
+
+
+@pytest.mark.parametrize(
+    ("theirs", "own", "message"),
+    [
+        ("half_cheetah", "half_cheetah_task", "has 19 and 6. Allowed: a run with 17 observation entries and 6 action"),
+        ("one_push", "task", "has 4 and 1. Allowed: a run with 4 observation entries and 2 action entries"),
+        (
+            *("gymnasium:Walker2d-v5", "half_cheetah_task"),
+            "is of another environment, gymnasium:Walker2d-v5, whose observation entry 0 is 'obs[0]', not 'z above the "
+            "start [m]'. Allowed: a run of half_cheetah_task, or of an environment whose entries have the same names",
+        ),
+        (
+            "turned",
+            "task",
+            "is of another environment, turned, whose action entry 0 is 'y push', not 'x push'. Allowed",
+        ),
+        ("numbered_too", "numbered", "another environment, numbered_too, whose observation entries are only numbered"),
+    ],
+)
+@pytest.mark.usefixtures("variants")
+def test_a_parent_of_another_environment_is_refused(
+    theirs: str, own: str, message: str, explored: Path, tmp_path: Path, capsys
+):
+    other = move(explored, theirs, tmp_path / "other")
+    assert run.main([*LEARN, f"--env={own}", f"--parent={other}", f"--out={tmp_path / 'run'}"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: --parent={str(other)!r} ") and message in line, line
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(("theirs", "own"), [("twin", "task"), ("numbered", "numbered")])
+@pytest.mark.usefixtures("variants")
+def test_a_parent_with_the_same_entries_will_do(theirs: str, own: str, explored: Path, tmp_path: Path):
+    other = move(explored, theirs, tmp_path / "other")
+    config = child_of(other, f"--env={own}")
+    assert parent.resolve(RunRef(str(other)), build.make_env(config), agent_of(config), config).step == 81
+
+
+def test_a_policy_by_gradient_ascent_is_handed_on_with_its_form(tmp_path: Path, capsys):
+    climbed, method = tmp_path / "climbed", "disagreement_grad"
+    form = ("--gradient.activation=tanh", "--gradient.log-std-max=1", "--gradient.no-act-greedily")
+    assert run.main(["--env=task", f"--method={method}", *tiny_flags(method), *form, f"--out={climbed}"]) == 0
+    capsys.readouterr()
+    config = child_of(climbed)
+    sac = config.explorer.task_sac
+    found = (sac.hidden, sac.activation, sac.log_std_map, sac.log_std_min, sac.log_std_max)
+    assert found == ((8,), "tanh", "tanh", -5.0, 1.0)
+    (theirs, state), own = explorer_of(climbed), agent_of(config)
+    adopted = own.adopt(own.init(jax.random.key(0)), theirs.actor(state))
+    obs, key = jax.random.normal(jax.random.key(3), (64, 4)), jax.random.key(1)
+    drawn, expected = (
+        jax.jit(agent.act)(key, agent.actor(one), obs) for agent, one in ((own, adopted), (theirs, state))
+    )
+    np.testing.assert_array_equal(drawn, expected)
+    for flag, message in (
+        ("--task-sac.activation=relu", "task_sac.activation='tanh', not 'relu'"),
+        ("--task-sac.log-std-max=2", "task_sac.log_std_max=1.0, not 2.0"),
+        ("--task-sac.log-std-map=clip", "task_sac.log_std_map='tanh', not 'clip'"),
+    ):
+        assert run.main([*LEARN, flag, f"--parent={climbed}", f"--out={tmp_path / 'run'}"]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert f"has a policy of another form ({message})" in line
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("method", ["maxinfo", "maxinfo_implicit", "rnd_sac"])
+def test_whatever_method_has_a_policy_that_lasts_takes_one_over(method: str, explored: Path):
+    words = [word for word in LEARN if "sac" not in word and "model-free" not in word]
+    words = [*words, f"--method={method}", f"--parent={explored}"]
+    config = run.inherited(parse(words)[1], words).config
+    (theirs, state), own = explorer_of(explored), agent_of(config)
+    assert own.adopt is not None
+    adopted = own.adopt(own.init(jax.random.key(0)), theirs.actor(state))
+    obs = jax.random.normal(jax.random.key(3), (64, 4))
+    mine, its = (
+        jax.jit(agent.act_greedily)(jax.random.key(1), agent.actor(one), obs)
+        for agent, one in ((own, adopted), (theirs, state))
+    )
+    np.testing.assert_array_equal(mine, its)
 
 
 def test_a_run_is_given_a_replay_that_holds_all_its_steps():
-    from experiments.runs.command import parse
-
     capacity = lambda *words: parse(["--method=random", *words])[1].config.explorer.data_capacity  # noqa: E731
     assert capacity() == capacity("--steps=9000") == 10_001
     assert capacity("--steps=20000") == 20_001
