@@ -242,8 +242,9 @@ def _carry_out(
         written = _write(asked, made, found.standings, found.failed, rates)
         print(f"\n{_summary(written, made)}", flush=True)
         for key, why in found.failed.items():
-            job = made.jobs[key]
-            print(f"error: {job.name} is not finished: {why} (see {plan.log_of(job)})", file=sys.stderr)
+            log = plan.log_of(made.jobs[key])
+            see = f" (see {log})" if log.exists() else ""
+            print(f"error: {made.jobs[key].name} is not finished: {why}{see}", file=sys.stderr)
         if watched:
             _stay(asked, board)
     return 1 if found.failed else 0

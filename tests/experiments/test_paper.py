@@ -15,6 +15,7 @@ from typing import NamedTuple
 import pytest
 
 from experiments import machine, paper
+from experiments.analysis.pages.markdown import plain
 from experiments.runs import lock
 from experiments.runs.directory import RunDirectory
 from experiments.runs.status import Status
@@ -45,7 +46,7 @@ def tell(*words: str) -> Told:
 
 @pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> str:
-    """The only figure: random actions in the acrobot and in the mountain car, which compile in no time."""
+    """The only figure: random actions in the acrobot, which compile in no time."""
     cells = tuple(
         Cell(label, "acrobot", "random", 2, STEPS, {**WARM_UP, "obs_noise": noise})
         for label, noise in (("still", 0.0), ("noisy", 0.1))
@@ -55,30 +56,34 @@ def small(monkeypatch: pytest.MonkeyPatch) -> str:
     return "small"
 
 
-def test_one_figure_from_the_runs_to_the_page(small: str, tmp_path: Path):
+def test_one_figure_of_the_paper_from_its_run_to_the_page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Figure 5, the quickest: one run. Figure 2 has five, and takes a minute."""
+    monkeypatch.setattr(paper, "KEPT", Path("no such place"))
     out = tmp_path / "out"
-    words = (small, "--preset=smoke", f"--out={out}")
+    words = ("ant_visits", "--preset=smoke", f"--out={out}")
     planned = tell(*words, "--dry-run")
-    assert planned.status == 0 and "2 runs, 0 of them finished" in planned.stdout
+    assert planned.status == 0 and "1 runs, 0 of them finished" in planned.stdout
     assert not out.exists()
     first = tell(*words)
     assert first.status == 0, first.stderr
-    assert re.search(r"small +not asked", first.stdout)
-    runs = sorted((out / plan.RUNS).iterdir())
-    assert [RunDirectory(run).status() for run in runs] == [Status.FINISHED] * 2
-    assert all(json.loads((run / "config.json").read_text())["num_seeds"] == 2 for run in runs)
+    assert re.search(r"ant_visits +(holds|does not hold)", first.stdout)
+    (run,) = (out / plan.RUNS).iterdir()
+    assert RunDirectory(run).status() is Status.FINISHED
+    assert json.loads((run / "config.json").read_text())["num_seeds"] == 2
     text = (out / "report.md").read_text()
-    assert "| still | 2: 0 to 1 |" in text and "| noisy | 2: 0 to 1 |" in text
-    assert f"experiments.paper small --preset=smoke --out={out}\n" in text
-    # Again, nothing is left to be done, and the runs stay as they are.
-    before = {run: (run / "metrics.jsonl").read_bytes() for run in runs}
+    assert "| implicit | 2: 0 to 1 |" in text and "Over five seeds our agent takes many ways" in text
+    assert f"experiments.paper ant_visits --preset=smoke --out={out}\n" in text
+    assert plain(machine.describe()) in text
+    assert (out / "pictures" / "ant_visits.svg").is_file() and (out / "csv" / "ant_visits.csv").is_file()
+    # Again, nothing is left to be done, and the run stays as it is.
+    before = (run / "metrics.jsonl").read_bytes()
     again = tell(*words)
     assert again.status == 0 and "0 of them left" in again.stderr
-    assert {run: (run / "metrics.jsonl").read_bytes() for run in runs} == before
-    assert "2 of them finished" in tell(*words, "--dry-run").stdout
+    assert (run / "metrics.jsonl").read_bytes() == before
+    assert "1 of them finished" in tell(*words, "--dry-run").stdout
     # A run that is there already is not made again.
-    other = (small, "--preset=smoke", f"--out={tmp_path / 'other'}", f"--runs={out / plan.RUNS}")
-    assert "2 of them finished" in tell(*other, "--dry-run").stdout
+    other = ("ant_visits", "--preset=smoke", f"--out={tmp_path / 'other'}", f"--runs={out / plan.RUNS}")
+    assert "1 of them finished" in tell(*other, "--dry-run").stdout
     assert tell(*other).status == 0
     assert not list((tmp_path / "other" / plan.RUNS).iterdir())
 
