@@ -154,6 +154,8 @@ def make(figures: Sequence[Figure], preset: str, out: Path, places: Iterable[Pat
         _plan_jobs(key, settings, out)
     jobs = {job.key: job for one in settings.values() for job in one.jobs}
     order = sorted(jobs.values(), key=lambda job: job.parent is not None)  # stable: the figures' order otherwise
+    names = [figure.name for figure in figures]
+    order = [job._replace(figures=tuple(sorted(job.figures, key=names.index))) for job in order]
     order += [_testbed(one, preset, out, figure.name) for figure in figures for one in figure.testbeds]
     cells = {line: _taken(settings[key], seeds) for line, (key, seeds) in lines.items()}
     return Plan(preset, out, list(figures), {job.key: job for job in order}, cells)

@@ -1,6 +1,7 @@
 """The paper from one command: what it refuses, what it plans, and one small figure from the runs to the page."""
 
 import contextlib
+import dataclasses
 import io
 import json
 import os
@@ -128,6 +129,19 @@ def test_a_plan_larger_than_the_disk(small: str, tmp_path: Path, monkeypatch: py
     told = tell(small, f"--out={tmp_path / 'out'}")
     assert told.status == 2 and "GiB of disk at the most" in told.stderr and told.stderr.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_a_plan_tells_its_time_by_as_many_as_memory_allows(small: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    (job, _) = plan.make([figures_of_paper.figures()[small]], "smoke", tmp_path / "out").jobs.values()
+    assert job.spec is not None
+    other = dataclasses.replace(job.spec, config=dataclasses.replace(job.spec.config, obs_noise=0.7))
+    by_hand.write(other, tmp_path / "others" / "of its kind", pace=0.1)
+    monkeypatch.setattr(paper.executors.machine, "cores", lambda: 8)
+    words = (small, "--preset=smoke", f"--out={tmp_path / 'out'}", f"--runs={tmp_path / 'others'}", "--dry-run")
+    # Two runs of two seeds of 100 steps, 0.05 s each.
+    for memory, told in ((2**40, "2 at a time: 10 s"), (2**30, "1 at a time: 20 s")):
+        monkeypatch.setattr(paper.executors.machine, "free_memory", lambda memory=memory: memory)
+        assert f"left: 20 s of computing, {told}; up to " in tell(*words).stdout
 
 
 def test_what_lies_there_is_not_overwritten(small: str, tmp_path: Path):
