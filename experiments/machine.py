@@ -2,8 +2,12 @@
 
 import contextlib
 import os
+import platform
 from pathlib import Path
 
+import jax
+
+CPUINFO = Path("/proc/cpuinfo")
 MEMINFO = Path("/proc/meminfo")
 GROUP = Path("/sys/fs/cgroup")
 """What Linux limits a container to, seen from inside of it."""
@@ -16,6 +20,19 @@ def cores() -> int:
     if quota.isdecimal() and period.strip().isdecimal():
         return max(1, min(bound, round(int(quota) / int(period))))
     return bound
+
+
+def describe() -> str:
+    """What computes here, in words: the processor and, if it is another one, the device; cores, system."""
+    names = _lines(CPUINFO, "model name")
+    processor = names[0].partition(":")[2].strip() if names else platform.processor() or platform.machine()
+    count = cores()
+    parts = [processor, f"{count} core{'s' if count > 1 else ''}", f"{platform.system()} {platform.machine()}"]
+    devices = jax.devices()
+    if devices[0].platform != "cpu":
+        many = f"{len(devices)} x " if len(devices) > 1 else ""
+        parts.insert(0, f"{many}{devices[0].device_kind}")
+    return ", ".join(parts)
 
 
 def free_memory() -> int:

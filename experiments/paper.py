@@ -16,20 +16,25 @@ from typing import NamedTuple
 
 import jax
 
-from experiments import machine, process, runtime
+from experiments import process, runtime
 from experiments.analysis import page
 from experiments.runs import lock, modules
 from experiments.runs.config import PRESETS
 from experiments.runs.errors import RunError, disk_error
-from experiments.studies import conduct, executors, figures_of_paper, plan, report, watch
+from experiments.studies import conduct, estimates, executors, figures_of_paper, plan, report, watch
 from experiments.studies.board import Board
-from experiments.studies.plan import Plan, Rates, Standing, State
+from experiments.studies.estimates import Rates
+from experiments.studies.found import runs_in
+from experiments.studies.plan import Plan, Standing, State
 from jaxplore import validate
 from jaxplore.validate import FieldError
 
 PROGRAM = "python -m experiments.paper"
 KEPT = Path(__file__).parent / "results" / "runs"
-"""Runs that come with the project; one whose identity is that of a run of the plan stands in for it."""
+"""Runs that come with the project; seeds of theirs whose settings are those of the plan count as done."""
+
+LINGER = 5.0
+"""Seconds that a page which loads itself has to do so for the last time."""
 
 
 class _Arguments(NamedTuple):
@@ -41,6 +46,8 @@ class _Arguments(NamedTuple):
     out: Path
     places: list[Path]
     every: float
+    words: tuple[str, ...]
+    """Flags for the commands that the report shows."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -57,26 +64,27 @@ def main(argv: Sequence[str] | None = None) -> int:
             modules.load(parsed.imports)
             asked = _check(parsed)
             runtime.share_device()
-            figures = figures_of_paper.choose(asked.names)
-            made = plan.make(figures, asked.preset, asked.out)
             plan.check_out(asked.out, asked.preset)
-            standings = plan.look_all(made, asked.places)
+            made, standings = _plan(asked)
             rates = _rates(asked, made)
             if parsed.dry_run:
-                print(plan.describe(made, standings, rates, machine.cores() if asked.executor == "local" else None))
+                print(estimates.describe(made, standings, rates, _at_a_time(asked, made, standings)))
                 return 0
             if parsed.report:
-                return _only_report(made, standings, rates)
-            plan.check_disk(made, standings)
-            executor = _executor(asked, made, standings)
+                _check_any(made, standings)
+            else:
+                estimates.check_disk(made, standings)
+            executor = None if parsed.report else _executor(asked, made, standings)
         except (ValueError, RunError) as error:
             print(f"error: {error}", file=sys.stderr)
             process.show_cause(error, debug=parsed.debug)
             return 2
         with lock.claimed(asked.out):
-            standings = plan.look_all(made, asked.places)  # Whoever had the directory until now has gone on.
+            made, standings = _plan(asked)  # Whoever had the directory until now has gone on.
+            if executor is None:
+                return _only_report(asked, made, standings, rates)
             return _carry_out(asked, made, standings, rates, executor, parsed.watch, parsed.port)
-    except RunError as error:
+    except (ValueError, RunError) as error:
         print(f"\nerror: {error}", file=sys.stderr)
         process.show_cause(error, debug=parsed.debug)
         return 1
@@ -124,21 +132,41 @@ def _check(parsed: argparse.Namespace) -> _Arguments:
     except FieldError as error:
         raise ValueError(error.spell("FIGURE" if error.field == "figure" else f"--{error.field}")) from error
     out = parsed.out or Path("runs") / f"paper-{parsed.preset}"
-    places = [*parsed.runs, KEPT]
-    return _Arguments(tuple(parsed.names), parsed.preset, parsed.executor, out, places, parsed.every)
+    words = [f"--out={parsed.out}"] if parsed.out else []
+    words += [f"--executor={parsed.executor}"] if parsed.executor != "local" else []
+    words += [*(f"--runs={place}" for place in parsed.runs), *(f"--import={name}" for name in parsed.imports)]
+    words += ["--report"] if parsed.report else []
+    names, places = tuple(parsed.names), [*parsed.runs, KEPT]
+    return _Arguments(names, parsed.preset, parsed.executor, out, places, parsed.every, tuple(words))
+
+
+def _plan(asked: _Arguments) -> tuple[Plan, dict[str, Standing]]:
+    """What there is to do, and where it stands by now."""
+    made = plan.make(figures_of_paper.choose(asked.names), asked.preset, asked.out, asked.places)
+    return made, plan.look_all(made)
 
 
 def _rates(asked: _Arguments, made: Plan) -> Rates:
-    own = made.out / plan.RUNS
-    return plan.rates(plan.runs_in([*asked.places, own]), made)
+    return estimates.rates(runs_in([*asked.places, made.out / plan.RUNS]), made)
+
+
+def _memory(made: Plan, standings: Mapping[str, Standing]) -> int:
+    """Bytes that the largest job needs."""
+    return max((estimates.size(job).memory for job in plan.open_jobs(made, standings)), default=1)
+
+
+def _on_cpu() -> bool:
+    return jax.default_backend() == "cpu"
+
+
+def _at_a_time(asked: _Arguments, made: Plan, standings: Mapping[str, Standing]) -> int | None:
+    """How many jobs go side by side; of a cluster, which is not asked for a plan alone, nobody knows."""
+    return executors.fitting(_memory(made, standings), on_cpu=_on_cpu()) if asked.executor == "local" else None
 
 
 def _executor(asked: _Arguments, made: Plan, standings: Mapping[str, Standing]) -> conduct.Executor:
-    todo = [made.jobs[key] for key, one in standings.items() if one.state in (State.TO_DO, State.PARTIAL)]
-    memory = max((plan.size(job).memory for job in todo), default=1)
-    on_cpu = jax.default_backend() == "cpu"
-    variables = _quick() if asked.preset == "smoke" else {}
-    return executors.make(asked.executor, made.out / "workers", memory, variables=variables, on_cpu=on_cpu)
+    variables, memory = _quick() if asked.preset == "smoke" else {}, _memory(made, standings)
+    return executors.make(asked.executor, made.out / "workers", memory, variables=variables, on_cpu=_on_cpu())
 
 
 def _quick() -> dict[str, str]:
@@ -150,21 +178,26 @@ def _quick() -> dict[str, str]:
     return found
 
 
-def _only_report(made: Plan, standings: Mapping[str, Standing], rates: Rates) -> int:
+def _check_any(made: Plan, standings: Mapping[str, Standing]) -> None:
     if not any(one.state is State.FINISHED for one in standings.values()):
         raise ValueError(f"--report: no run of these figures is finished in --out={made.out}. Leave --report out.")
-    print(_summary(_write(made, standings, {}, rates), made))
+
+
+def _only_report(asked: _Arguments, made: Plan, standings: Mapping[str, Standing], rates: Rates) -> int:
+    plan.write_record(made)
+    print(_summary(_write(asked, made, standings, {}, rates), made))
     return 0
 
 
 def _write(
+    asked: _Arguments,
     made: Plan,
     standings: Mapping[str, Standing],
     failed: Mapping[str, str],
     rates: Rates,
     refresh: float | None = None,
 ) -> page.Report:
-    found = report.make(made, standings, failed, rates)
+    found = report.make(made, standings, failed, rates, asked.words)
     try:
         page.write(found, made.out, refresh)
     except OSError as error:
@@ -189,7 +222,7 @@ def _carry_out(
 ) -> int:
     plan.write_settings(made, standings)
     board = Board(made, rates, executor.at_a_time)
-    todo = [one for one in standings.values() if one.state in (State.TO_DO, State.PARTIAL)]
+    todo = plan.open_jobs(made, standings)
     board.say(
         f"{len(made.figures)} figures, preset {made.preset}: {len(made.jobs)} runs, {len(todo)} of them left, "
         f"{min(executor.at_a_time, max(1, len(todo)))} at a time by {executor.name}; writing to {made.out}"
@@ -201,16 +234,19 @@ def _carry_out(
         if watched and time.monotonic() - last[0] > asked.every:
             last[0] = time.monotonic()
             with contextlib.suppress(RunError, ValueError):  # of a run that is being written
-                _write(made, now, failed, rates, asked.every)
+                _write(asked, made, now, failed, rates, asked.every)
 
     with _served(made.out, port, board) if watched else contextlib.nullcontext():
         found = conduct.carry_out(made, standings, executor, tell, board.again)
-    board.clear()
-    written = _write(made, found.standings, found.failed, rates)
-    print(f"\n{_summary(written, made)}", flush=True)
-    for key, why in found.failed.items():
-        job = made.jobs[key]
-        print(f"error: {job.name} is not finished: {why} (see {plan.log_of(job)})", file=sys.stderr)
+        board.clear()
+        written = _write(asked, made, found.standings, found.failed, rates)
+        print(f"\n{_summary(written, made)}", flush=True)
+        for key, why in found.failed.items():
+            log = plan.log_of(made.jobs[key])
+            see = f" (see {log})" if log.exists() else ""
+            print(f"error: {made.jobs[key].name} is not finished: {why}{see}", file=sys.stderr)
+        if watched:
+            _stay(asked, board)
     return 1 if found.failed else 0
 
 
@@ -219,6 +255,17 @@ def _served(out: Path, port: int, board: Board) -> Iterator[None]:
     with watch.serve(out, port) as address:
         board.say(f"the report as it grows: {address}")
         yield
+
+
+def _stay(asked: _Arguments, board: Board) -> None:
+    """Go on serving what is finished: on a terminal until Ctrl-C, elsewhere until an open page has loaded itself."""
+    person = sys.stdin is not None and sys.stdin.isatty()
+    seconds = asked.every + LINGER
+    board.say(f"The report is finished, and served {'until Ctrl-C' if person else f'for {seconds:.0f} s more'}.")
+    with contextlib.suppress(KeyboardInterrupt):
+        while person or seconds > 0:
+            time.sleep(min(1.0, max(seconds, 0.0)) or 1.0)
+            seconds -= 1.0
 
 
 if __name__ == "__main__":

@@ -118,6 +118,15 @@ def paired_returns(one: Returns, other: Returns) -> PairedReturns | None:
     return PairedReturns(int(first), int(last), final, mean) if final and mean else None
 
 
+def grid_of(first: int, last: int) -> np.ndarray:
+    """Steps at which curves are compared, `[T]`: `POINTS` of them, evenly spaced up to the last, without those before
+    the first row. Their mean over these is a curve's mean height.
+    """
+    grid = np.unique(np.linspace(last / POINTS, last, POINTS).round().astype(int))
+    # A point before the first round has nothing to show: rounds are as long as the warm-up at most.
+    return grid[grid >= first]
+
+
 def outcomes(run: LoadedRun) -> list[Outcome]:
     """What became of each seed of a run."""
     config, rows, found = run.config, run.rows, []
@@ -179,9 +188,7 @@ def group(
     first = loaded[0].config
     named = [name or one.config.method for name, one in zip(names or [None] * len(loaded), loaded, strict=True)]
     labels = list(dict.fromkeys(named))
-    # A first point before the first round has nothing to show: rounds are as long as the warm-up at most.
-    grid = np.unique(np.linspace(first.steps / POINTS, first.steps, POINTS).round().astype(int))
-    grid = grid[grid >= max(min(row["step"] for row in one.rows) for one in loaded)]
+    grid = grid_of(max(min(row["step"] for row in one.rows) for one in loaded), first.steps)
     groups = []
     for label in labels:
         own: list[Outcome] = []

@@ -1,6 +1,6 @@
 """Numbers and tables as text: one number format, one printer for terminals, one for Markdown."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 
 def number(value: float | None) -> str:
@@ -20,6 +20,17 @@ def duration(seconds: float) -> str:
 def span(low: str, high: str, to: str = " to ") -> str:
     """A range; one end where both are the same."""
     return low if low == high else f"{low}{to}{high}"
+
+
+def spans(numbers: Iterable[int]) -> str:
+    """Whole numbers as ranges, such as `"20 to 24, 27"`."""
+    found: list[list[int]] = []
+    for number in sorted(set(numbers)):
+        if found and found[-1][1] == number - 1:
+            found[-1][1] = number
+        else:
+            found.append([number, number])
+    return ", ".join(span(str(low), str(high)) for low, high in found)
 
 
 def text_table(head: Sequence[str], lines: Sequence[Sequence[str]]) -> str:

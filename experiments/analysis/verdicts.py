@@ -1,16 +1,35 @@
 """Whether a claim holds: conditions on the numbers of a few seeds, each with its words."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from experiments.analysis.intervals import interval, paired
+from experiments.analysis.pages.contents import Verdict
 from experiments.analysis.tables import number
 
 Answer = Literal["holds", "does not hold", "undecided", "not run"]
 Scores = Mapping[str, Mapping[int, float]]
-"""Label -> seed -> number, turned so that higher is better."""
+"""Label -> seed -> number."""
+NONE: Mapping[str, Any] = {}
+
+
+class Numbers(NamedTuple):
+    """What conditions ask of one part of a figure."""
+
+    scores: Scores = NONE
+    """The measure's own, turned so that higher is better."""
+    unit: str = ""
+    """Of their differences, as words after a number."""
+    ends: Scores = NONE
+    """How high the curves end."""
+    changes: Scores = NONE
+    """How high the curves are later, as a multiple of how high they are at first."""
+    rises: Scores = NONE
+    """The same until all had been seen."""
+    wanted: Mapping[str, int] = NONE
+    """Label -> seeds that there are to be."""
 
 
 class Condition(NamedTuple):
@@ -18,11 +37,9 @@ class Condition(NamedTuple):
 
     text: str
     part: int
-    """Of the figure's parts, the one whose numbers are asked."""
-    decide: Callable[[Scores], tuple[Answer, str]]
+    """Of the figure's parts, the one whose numbers are asked; testbeds come after them."""
+    decide: Callable[[Numbers], tuple[Answer, str]]
     """The answer, and why."""
-    of_ends: bool = False
-    """Whether it asks how high the curves end, and not for the measure's own number."""
 
 
 def ahead(first: str, second: str, part: int = 0) -> Condition:
@@ -30,7 +47,8 @@ def ahead(first: str, second: str, part: int = 0) -> Condition:
     It does not hold where the interval is below 0.
     """
 
-    def decide(scores: Scores) -> tuple[Answer, str]:
+    def decide(numbers: Numbers) -> tuple[Answer, str]:
+        scores, unit = numbers.scores, f" {numbers.unit}" if numbers.unit else ""
         missing = [name for name in (first, second) if not scores.get(name)]
         if missing:
             return "not run", f"no runs of {' and '.join(missing)}"
@@ -39,73 +57,107 @@ def ahead(first: str, second: str, part: int = 0) -> Condition:
             return "undecided", f"{first} and {second} have no seed in common"
         mean, half = found.difference
         if half is None:
-            return "undecided", f"{first} less {second}: {number(mean)} on one seed"
-        why = f"{first} less {second}: {number(mean)} ± {number(half)} on {len(found.seeds)} seeds"
+            return "undecided", f"by {number(mean)}{unit} on one seed"
+        why = f"by {number(mean)} ± {number(half)}{unit} on {len(found.seeds)} seeds"
         return "holds" if mean - half > 0 else "does not hold" if mean + half < 0 else "undecided", why
 
     return Condition(f"{first} ahead of {second}", part, decide)
 
 
 def at_most(label: str, most: float, part: int = 0) -> Condition:
-    """A label's curves end at or below a value, on average: the mean's 95 % interval is. It does not hold where the
-    interval is above.
-    """
+    """The curve of every seed of a label ends at or below a value; it does not hold if one ends above."""
 
-    def decide(scores: Scores) -> tuple[Answer, str]:
-        return _beside(label, scores, lambda low, high: (high <= most, low > most))
+    def decide(numbers: Numbers) -> tuple[Answer, str]:
+        return _on_every_seed(label, numbers, lambda end: end <= most + 1e-6, "highest", max)
 
-    return Condition(f"{label} at {most:.0%} or less", part, decide, of_ends=True)
+    return Condition(f"{label} at {most:.0%} or less on every seed", part, decide)
 
 
 def at_least(label: str, least: float, part: int = 0) -> Condition:
-    """The curve of every seed of a label comes to a value; it does not hold where none does."""
+    """The curve of every seed of a label comes to a value; it does not hold if one does not."""
 
-    def decide(scores: Scores) -> tuple[Answer, str]:
-        values = list(scores.get(label, {}).values())
-        if not values:
-            return "not run", f"no runs of {label}"
-        there = sum(value >= least - 1e-6 for value in values)
-        answer = "holds" if there == len(values) else "does not hold" if there == 0 else "undecided"
-        return answer, f"{label} comes to {least:.0%} on {there} of {len(values)} seeds"
+    def decide(numbers: Numbers) -> tuple[Answer, str]:
+        return _on_every_seed(label, numbers, lambda end: end >= least - 1e-6, "lowest", min)
 
-    return Condition(f"{label} at {least:.0%} on every seed", part, decide, of_ends=True)
+    return Condition(f"{label} at {least:.0%} on every seed", part, decide)
 
 
-def stays(label: str, part: int = 0) -> Condition:
-    """A label's curves are as high later as at first, on average: the 95 % interval of the measure's number, later over
-    at first, is at or above 1. It does not hold where the interval is below.
+def _on_every_seed(
+    label: str, numbers: Numbers, is_so: Callable[[float], bool], worst: str, of: Callable[[list[float]], float]
+) -> tuple[Answer, str]:
+    values = list(numbers.ends.get(label, {}).values())
+    if not values:
+        return "not run", f"no runs of {label}"
+    there, missing = sum(map(is_so, values)), numbers.wanted.get(label, 0) - len(values)
+    why = f"on {there} of {len(values)} seeds, the {worst} at {of(values):.0%}"
+    if there < len(values):
+        return "does not hold", why
+    return ("undecided", f"{why}; {missing} more are not there") if missing > 0 else ("holds", why)
+
+
+def falls(label: str, part: int = 0) -> Condition:
+    """A label's curves are lower later than at first, on average: the 95 % interval of later over at first is below 1.
+    It does not hold where the interval is above.
     """
 
-    def decide(scores: Scores) -> tuple[Answer, str]:
-        return _beside(label, scores, lambda low, high: (low >= 1.0, high < 1.0))
+    def decide(numbers: Numbers) -> tuple[Answer, str]:
+        return _beside(label, numbers.changes, lambda low, high: (high < 1.0, low >= 1.0))
 
-    return Condition(f"{label} as high later as at first", part, decide)
+    return Condition(f"{label} lower in the second half than in the first", part, decide)
+
+
+def rises(label: str, part: int = 0) -> Condition:
+    """A label's curves are higher later than at first, on average, of the steps until all had been seen: the 95 %
+    interval of later over at first is above 1. It does not hold where the interval is below.
+    """
+
+    def decide(numbers: Numbers) -> tuple[Answer, str]:
+        return _beside(label, numbers.rises, lambda low, high: (low > 1.0, high <= 1.0))
+
+    return Condition(f"{label} higher later than at first, until all had been seen", part, decide)
+
+
+def ranks(label: str, part: int = 0) -> Condition:
+    """A belief's variance ranks its errors, on every kind of transitions in every fit: the rank correlation, here the
+    lowest of a fit, is above 0.
+    """
+
+    def decide(numbers: Numbers) -> tuple[Answer, str]:
+        values = list(numbers.scores.get(label, {}).values())
+        if not values:
+            return "not run", f"no fits of {label}"
+        there = sum(value > 0 for value in values)
+        why = f"in {there} of {len(values)} fits; the lowest is {number(min(values))}"
+        return "holds" if there == len(values) else "does not hold", why
+
+    return Condition(f"{label}'s variance and errors correlated by rank", part, decide)
 
 
 def _beside(label: str, scores: Scores, compare: Callable[[float, float], tuple[bool, bool]]) -> tuple[Answer, str]:
-    values = np.array(list(scores.get(label, {}).values()))
+    values = np.array([value for value in scores.get(label, {}).values() if np.isfinite(value)])
     if not len(values):
         return "not run", f"no runs of {label}"
     mean, half = interval(values)
-    good, bad = compare(mean - (half or 0.0), mean + (half or 0.0))
-    width = "" if half is None else f" ± {number(half)}"
-    return "holds" if good else "does not hold" if bad else "undecided", f"{label}: {number(mean)}{width}"
+    if half is None:
+        return "undecided", f"{number(mean)} times as high on one seed"
+    good, bad = compare(mean - half, mean + half)
+    why = f"{number(mean)} ± {number(half)} times as high on {len(values)} seeds"
+    return "holds" if good else "does not hold" if bad else "undecided", why
 
 
-def judge(conditions: Sequence[Condition], scores: Sequence[Scores], ends: Sequence[Scores]) -> tuple[Answer, str]:
+def judge(conditions: Sequence[Condition], numbers: Sequence[Numbers]) -> tuple[Verdict, str]:
     """The claim's answer, and the reasons of all conditions.
 
     It holds if every condition does, and does not hold if one of them does not. Where there is nothing to ask, it was
-    not run; where only some of it is there, it is undecided.
+    not run; where only some of it is there, it is undecided. Without conditions nothing was asked.
 
     Args:
         conditions: all of the claim's.
-        scores: of each part, turned so that higher is better.
-        ends: of each part, as they are.
+        numbers: of each part.
     """
     if not conditions:
-        return "undecided", "no rule decides this one: see the table"
-    found = [condition.decide((ends if condition.of_ends else scores)[condition.part]) for condition in conditions]
+        return "not asked", "no condition decides this one: see the table"
+    found = [condition.decide(numbers[condition.part]) for condition in conditions]
     answers = [answer for answer, _ in found]
     why = "; ".join(f"{one.text}: {answer} ({how})" for one, (answer, how) in zip(conditions, found, strict=True))
     if "does not hold" in answers:

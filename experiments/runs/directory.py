@@ -3,7 +3,7 @@
 | file | what |
 | --- | --- |
 | `config.json` | the specification: settings, format, parent, identity |
-| `versions.json` | versions of everything that results depend on, when the run began |
+| `versions.json` | versions of everything that results depend on, and the machine, when the run began |
 | `scene.json` | what coverage counts, the floor plan, units: what reports need of the environment |
 | `metrics.jsonl` | a row per round and seed; compressed, `metrics.jsonl.gz`, in a run that was kept |
 | `checkpoints/` | the latest states, whole, and those of `keep_at` |
@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments import runtime
+from experiments import machine, runtime
 from experiments.runs import lock
 from experiments.runs import scene as scenes
 from experiments.runs import spec as specs
@@ -43,6 +43,8 @@ from experiments.runs.wandb import WandbLog
 CONFIG, VERSIONS, SCENE, OUTCOME = "config.json", "versions.json", "scene.json", "outcome.json"
 METRICS, PACKED_METRICS, WALK = "metrics.jsonl", "metrics.jsonl.gz", "walk.npz"
 CHECKPOINTS, TENSORBOARD, WANDB = "checkpoints", "tensorboard", "wandb"
+MACHINE = "machine"
+"""Of `VERSIONS`, what the run began on."""
 CALIBRATION, OLD_CALIBRATION = "calibration.json", "posterior.json"
 KEPT = (CONFIG, VERSIONS, SCENE, OUTCOME, CALIBRATION, OLD_CALIBRATION, WALK)
 """Files that `RunDirectory.keep` copies as they are, those that there are."""
@@ -141,13 +143,21 @@ class RunDirectory:
         except (OSError, ValueError) as error:
             raise self._unreadable(SCENE, error, "put back a copy of the file") from error
 
+    def versions(self) -> dict[str, Any]:
+        """Versions that the run began with; empty where they cannot be read."""
+        try:
+            return read_json(self.path / VERSIONS)
+        except (OSError, ValueError):
+            return {}
+
+    def machine(self) -> str:
+        """What the run began on, in words; empty in a run of before that was saved. Resumed elsewhere it goes on."""
+        found = self.versions().get(MACHINE)
+        return found if isinstance(found, str) else ""
+
     def changed_versions(self) -> list[str]:
         """What has another version now than when the run began, as `name: then -> now`."""
-        try:
-            then = read_json(self.path / VERSIONS)
-        except (OSError, ValueError):
-            return []
-        now = runtime.versions()
+        then, now = self.versions(), runtime.versions()
         return [f"{name}: {then[name]} -> {new}" for name, new in now.items() if then.get(name, new) != new]
 
     # What it came to.
@@ -155,6 +165,25 @@ class RunDirectory:
     def rows(self) -> list[dict[str, Any]]:
         """All rows. Raises `RunError` if they cannot be read."""
         return read_metrics(self.path / METRICS)
+
+    def diverged(self) -> dict[int, dict[str, Any]]:
+        """Of each seed that diverged, `step` and `what` was not finite.
+
+        Raises:
+            RunError: its files cannot be read.
+        """
+        try:
+            found = read_json(self.path / OUTCOME)["diverged"]
+            return {int(seed): {"step": how.get("step"), "what": how.get("what")} for seed, how in found.items()}
+        except FileNotFoundError:  # It is not finished, or from before there were outcomes.
+            rows = [row for row in self.rows() if row.get("diverged")] if self.has_rows() else []
+            return {row["seed"]: {"step": row["step"], "what": row["diverged"]} for row in rows}
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+            raise self._unreadable(OUTCOME, error, "remove it, and finish with --resume") from error
+
+    def has_rows(self) -> bool:
+        """Whether a row has been written."""
+        return (self.path / METRICS).exists() or (self.path / PACKED_METRICS).exists()
 
     def walk(self) -> tuple[np.ndarray, np.ndarray]:
         """Where each step began, `[S, steps, 2]` [m], and the step of its episode that it was, `[S, steps]`.
@@ -207,7 +236,7 @@ class RunDirectory:
             RunError: the disk is full or cannot be written.
         """
         texts = {
-            VERSIONS: json.dumps(runtime.versions(), indent=2) + "\n",
+            VERSIONS: json.dumps({**runtime.versions(), MACHINE: machine.describe()}, indent=2) + "\n",
             SCENE: scenes.to_json(scene),
             CONFIG: specs.to_json(spec),  # Last: with it, this is a run.
         }

@@ -7,7 +7,8 @@ from typing import TextIO
 
 from experiments.analysis.tables import duration
 from experiments.studies.display import Screen
-from experiments.studies.plan import Plan, Rates, Standing, State, seconds_left
+from experiments.studies.estimates import Rates, seconds_left
+from experiments.studies.plan import Plan, Standing, State
 
 RECENT = 20
 """Looks at a run that its pace is taken from."""

@@ -18,6 +18,8 @@ POLL = 0.5
 """Seconds between two looks at the processes."""
 GRACE = 20.0
 """Seconds that processes have to stop by themselves; they are killed then, which a run can bear at any moment."""
+FEWER = ": give fewer --processes"
+"""What to do where memory was short, for a command that has that flag."""
 TAIL = 2**16
 """Bytes at the end of a log in which an error is looked for."""
 
@@ -82,7 +84,7 @@ def run_all(
             time.sleep(POLL)
             for one in [one for one in running if one.popen.poll() is not None]:
                 running.remove(one)
-                ended[one.job.key] = end(one)
+                ended[one.job.key] = end(one, FEWER)
         tell([], ended)
     finally:
         stop(running)
@@ -135,14 +137,14 @@ def _let_go(one: Process) -> None:
             one.popen.stdin.close()
 
 
-def end(one: Process) -> End:
-    """How a process that has ended did."""
+def end(one: Process, remedy: str = "") -> End:
+    """How a process that has ended did; `remedy` is what to do where memory may have been short."""
     status = one.popen.returncode
     _let_go(one)
-    return End(status, None if status == 0 else _reason(status, one.job.log, one.before))
+    return End(status, None if status == 0 else _reason(status, one.job.log, one.before, remedy))
 
 
-def _reason(status: int, log: Path, before: int) -> str:
+def _reason(status: int, log: Path, before: int, remedy: str) -> str:
     """Why a process failed: the error that it printed; without one, the signal, or the last thing that it printed."""
     try:
         with log.open("rb") as file:
@@ -157,6 +159,6 @@ def _reason(status: int, log: Path, before: int) -> str:
         return "it was stopped"
     if status < 0:
         name = signal.Signals(-status).name if -status in set(signal.Signals) else f"signal {-status}"
-        hint = ", perhaps because memory was short: give fewer --processes" if name == "SIGKILL" else ""
+        hint = f", perhaps because memory was short{remedy}" if name == "SIGKILL" else ""
         return f"it was ended by {name}{hint}"
     return f"exit status {status}" + (f" after: {lines[-1]}" if lines else "")

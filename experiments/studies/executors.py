@@ -8,6 +8,7 @@ import contextlib
 import importlib
 import os
 import socket
+import subprocess
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -27,7 +28,7 @@ PATIENCE = 90.0
 MINUTES = 24 * 60
 """Of a Slurm job; a run that does not get through in that time resumes in the next one."""
 REACH = 10.0
-"""Seconds in which a Ray cluster must answer."""
+"""Seconds in which a cluster must answer."""
 ON_MACHINES = 1_000
 """Jobs at a time where a scheduler decides."""
 
@@ -48,11 +49,15 @@ def make(name: str, folder: Path, memory: int, *, variables: Mapping[str, str], 
     """
     validate.one_of("executor", name, NAMES)
     if name == "local":
-        fit = min(machine.cores(), machine.free_memory() // memory)
-        return local(max(1, fit) if on_cpu else 1, variables)
+        return local(fitting(memory, on_cpu=on_cpu), variables)
     if name == "slurm":
         return slurm(folder, memory, variables)
     return ray(memory, variables)
+
+
+def fitting(memory: int, *, on_cpu: bool) -> int:
+    """How many jobs of so many bytes this machine has cores and memory for; on another device than the CPU one."""
+    return max(1, min(machine.cores(), machine.free_memory() // memory)) if on_cpu else 1
 
 
 def local(at_a_time: int, variables: Mapping[str, str]) -> Executor:
@@ -104,22 +109,30 @@ def slurm(folder: Path, memory: int, variables: Mapping[str, str], cluster: str 
         cluster: `local`: processes in Slurm's place, for tests. None: Slurm.
 
     Raises:
-        RunError: the package is missing, or there is no Slurm.
+        RunError: the package is missing, there is no Slurm, or it does not answer.
     """
     submitit = _package("submitit", "slurm")
     try:
+        if cluster is None:
+            _ask_slurm()
         executor = submitit.AutoExecutor(folder=str(folder.resolve()), cluster=cluster or "slurm")
-    except RuntimeError as error:
+    except (RuntimeError, OSError, subprocess.TimeoutExpired) as error:
         raise RunError(
             f"--executor=slurm: {_line(error)}. What to do: start it where sbatch works, or --executor=local."
         ) from error
     executor.update_parameters(name="jaxplore", timeout_min=MINUTES, mem_gb=-(-memory // 2**30), cpus_per_task=1)
 
     def start(job: Job) -> Any:
-        return executor.submit(work, Work(job, dict(variables)))
+        try:
+            return executor.submit(work, Work(job, dict(variables)))
+        except Exception as error:  # submitit's own, with what sbatch said.
+            raise RunError(f"Slurm has not taken it: {_line(error)}") from error
 
     def poll(submitted: Any) -> End | None:
-        if not submitted.done():
+        try:
+            if not submitted.done():
+                return None
+        except Exception:  # Slurm does not answer now; the job may well go on.
             return None
         try:
             return submitted.result()
@@ -135,6 +148,19 @@ def slurm(folder: Path, memory: int, variables: Mapping[str, str], cluster: str 
             time.sleep(execute.POLL)
 
     return Executor("slurm", ON_MACHINES, start, poll, stop)
+
+
+def _ask_slurm() -> None:
+    """Raise unless Slurm's controller answers: `sbatch` may be there without one.
+
+    Raises:
+        RuntimeError: it does not; says what Slurm says.
+        OSError: there is no Slurm.
+        subprocess.TimeoutExpired: it takes too long.
+    """
+    asked = subprocess.run(["sinfo", "--noheader"], capture_output=True, text=True, timeout=REACH, check=False)
+    if asked.returncode != 0:
+        raise RuntimeError(asked.stderr.strip() or f"sinfo ended with status {asked.returncode}")
 
 
 def ray(memory: int, variables: Mapping[str, str], address: str | None = None) -> Executor:

@@ -1,40 +1,34 @@
-"""Figures as jobs: each run once, however many figures need it, parents before their children."""
+"""Figures as jobs: each run once, however many figures need it, parents before their children.
+
+What a figure's line wants is seeds of a setting. Those that a finished run carries, wherever it lies and beside
+whatever other seeds, are taken from there; what is left becomes jobs.
+"""
 
 import contextlib
 import dataclasses
 import enum
 import functools
 import json
-import math
 import shutil
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import jax
+from typing import NamedTuple
 
 import envs
-from experiments.analysis.tables import duration, markdown_table
 from experiments.runs import inherit, lock
 from experiments.runs.config import RunConfig
 from experiments.runs.directory import RunDirectory
 from experiments.runs.errors import RunError, disk_error
 from experiments.runs.files import read_json, write_text
 from experiments.runs.metrics import last_row
-from experiments.runs.seeds import expand
 from experiments.runs.spec import RunRef, RunSpec, to_json
 from experiments.runs.status import Status
-from experiments.studies.figures_of_paper import Cell, Figure, Testbed, config_of
-from experiments.studies.seeds import PER_STATE, PROCESS
+from experiments.studies.figures_of_paper import Cell, Figure, Part, Testbed, config_of
+from experiments.studies.found import Found, find, seeds_of, setting_of
 from experiments.training import build
-from experiments.training.programs import make_programs
 
 RUNS, SETTINGS, LOGS, TESTBEDS, RECORD = "runs", "settings", "logs", "testbeds", "paper.json"
 """What the directory of a paper holds beside its page."""
-STATE = 32 * 2**20
-"""Bytes of a seed's state without its transitions, at the most that the small presets have (5 to 26 MiB were seen)."""
-ROW = 2_000
-"""Bytes that a round leaves on the disk: its row, and the same as TensorBoard events."""
 SMOKE_TESTBED = ("--data=acrobot", "--fit-steps=20")
 
 
@@ -49,13 +43,14 @@ class State(enum.Enum):
 
 
 class Job(NamedTuple):
-    """One run of the plan, or one belief on the testbed."""
+    """One run of the plan, here or, finished, elsewhere; or one belief on the testbed."""
 
     key: str
     """Its identity; of a testbed, its name."""
     name: str
     """Of its directory, or of its file."""
     path: Path
+    """Where it is, or will be: among the plan's own runs, or where a finished run was found."""
     spec: RunSpec | None
     """None: a testbed."""
     words: tuple[str, ...] = ()
@@ -63,18 +58,17 @@ class Job(NamedTuple):
     parent: str | None = None
     """The key of the job that it starts from."""
     figures: tuple[str, ...] = ()
-    needs_walk: bool = False
-    is_parent: bool = False
-    """Whether another job starts from its checkpoints."""
-
-    @property
-    def seeds(self) -> range:
-        """The seeds that it carries."""
-        return range(0) if self.spec is None else range(self.spec.config.seed, _end(self.spec.config))
+    seeds: tuple[int, ...] = ()
+    """Those of its seeds that figures take from it, or the runs that start from it."""
 
 
-def _end(config: RunConfig) -> int:
-    return config.seed + config.num_seeds
+class Taken(NamedTuple):
+    """What a line of a figure takes."""
+
+    keys: tuple[str, ...]
+    """Of the runs."""
+    seeds: tuple[int, ...]
+    """All that it wants, of whichever run."""
 
 
 class Plan(NamedTuple):
@@ -84,8 +78,8 @@ class Plan(NamedTuple):
     out: Path
     figures: list[Figure]
     jobs: dict[str, Job]
-    cells: dict[tuple[str, int, str], tuple[str, ...]]
-    """Figure, part and label -> keys of its runs."""
+    cells: dict[tuple[str, int, str], Taken]
+    """Figure, part and label -> what it takes."""
 
 
 class Standing(NamedTuple):
@@ -93,76 +87,104 @@ class Standing(NamedTuple):
 
     state: State
     step: int
-    path: Path
-    """Where it is: in the plan's own directory, or a finished run elsewhere."""
     reason: str = ""
     """Of one that diverged."""
 
 
-def make(figures: Sequence[Figure], preset: str, out: Path) -> Plan:
+@dataclasses.dataclass
+class _Setting:
+    """Runs that differ in their seed alone, and what is wanted of them."""
+
+    spec: RunSpec
+    """Of its first seed; without the parent's identity."""
+    parent: str | None
+    """The key of the setting that it starts from."""
+    together: bool
+    """Whether its seeds go side by side in one run."""
+    wanted: dict[str, set[int]] = dataclasses.field(default_factory=dict)
+    """Figure -> seeds."""
+    needs_walk: bool = False
+    needs_returns: bool = False
+    states: dict[int, set[int]] = dataclasses.field(default_factory=dict)
+    """Seed -> steps whose checkpoints unfinished runs start from."""
+    taken: dict[Found, set[int]] = dataclasses.field(default_factory=dict)
+    """Runs that are there -> the seeds that are taken from each."""
+    missing: set[int] = dataclasses.field(default_factory=set)
+    """Seeds of runs that are still to be made."""
+    jobs: list[Job] = dataclasses.field(default_factory=list)
+
+    @property
+    def seeds(self) -> set[int]:
+        """All seeds that are wanted."""
+        return set().union(*self.wanted.values())
+
+
+def make(figures: Sequence[Figure], preset: str, out: Path, places: Iterable[Path] = ()) -> Plan:
     """The plan of some figures. Nothing is written.
 
-    Seeds of an environment on the device go side by side in one run, and so do all of the smoke preset, most of whose
-    time is starting; others have a run each.
+    A seed is done if a finished run carries it whose settings are the same but for the seeds, in which it did not
+    diverge, and which has what the figures need of it: a walk, evaluations, checkpoints for others to start from.
+
+    Missing seeds of an environment on the device go side by side in one run, and so do all of the smoke preset, most of
+    whose time is starting; others have a run each.
 
     Args:
         figures: in the order in which they are to be done.
         preset: `laptop`, `paper` or `smoke`.
         out: the directory that it is for.
+        places: directories of other runs.
 
     Raises:
         ValueError: an environment cannot be made here, or a setting is refused.
+        RunError: a run in `out` is finished and lacks something; says what.
     """
     # Absolute: a worker elsewhere has another working directory.
-    out, jobs = out.absolute(), dict[str, Job]()
-    cells: dict[tuple[str, int, str], tuple[str, ...]] = {}
+    out, settings = out.absolute(), dict[str, _Setting]()
+    lines: dict[tuple[str, int, str], tuple[str, tuple[int, ...]]] = {}
     for figure in figures:
         for number, part in enumerate(figure.parts):
             for cell in part.of(preset):
-                keys = _add(cell, preset, out, jobs, figure.name, needs_walk=part.measure.needs_walk)
-                cells[figure.name, number, cell.label] = keys
-        for testbed in figure.testbeds:
-            job = _testbed(testbed, preset, out, figure.name)
-            jobs[job.key] = job
+                lines[figure.name, number, cell.label] = _want(cell, preset, settings, figure.name, part)
+    kinds = {(one.spec.config.env, one.spec.config.method) for one in settings.values()}
+    there = find(out / RUNS, places, kinds)
+    runs = {key: there.get(setting_of(one.spec), []) for key, one in settings.items()}
+    for key in reversed(settings):  # Children first: what is left of them decides on what their parents must have.
+        _take(key, settings, runs)
+    for key in settings:
+        _plan_jobs(key, settings, out)
+    jobs = {job.key: job for one in settings.values() for job in one.jobs}
     order = sorted(jobs.values(), key=lambda job: job.parent is not None)  # stable: the figures' order otherwise
+    names = [figure.name for figure in figures]
+    order = [job._replace(figures=tuple(sorted(job.figures, key=names.index))) for job in order]
+    order += [_testbed(one, preset, out, figure.name) for figure in figures for one in figure.testbeds]
+    cells = {line: _taken(settings[key], seeds) for line, (key, seeds) in lines.items()}
     return Plan(preset, out, list(figures), {job.key: job for job in order}, cells)
 
 
-def _add(
-    cell: Cell,
-    preset: str,
-    out: Path,
-    jobs: dict[str, Job],
-    figure: str,
-    *,
-    needs_walk: bool = False,
-) -> tuple[str, ...]:
-    """Put the runs of a cell among the jobs, its parent's before them, and give their keys."""
+def _want(
+    cell: Cell, preset: str, settings: dict[str, _Setting], figure: str, part: Part | None
+) -> tuple[str, tuple[int, ...]]:
+    """Put what a cell wants among the settings, its parent's before it, and give its key and the seeds. What is wanted
+    of a parent is not known yet, and `part` is None.
+    """
     config = config_of(cell, preset)
-    env = _environment(config)
-    config = dataclasses.replace(config, backend=env.backend)
-    parents: tuple[str, ...] = ()
-    at = cell.parent_at.get(preset)
+    env = environment(config)
+    config, parent, ref = dataclasses.replace(config, backend=env.backend), None, None
     if cell.parent is not None:
-        parents = _add(cell.parent, preset, out, jobs, figure)
+        parent, _ = _want(cell.parent, preset, settings, figure, None)
+        theirs = settings[parent].spec.config
+        ref = RunRef("", cell.parent_at.get(preset) or theirs.steps)
+        config = inherit.take_form(config, theirs)
+    spec = RunSpec(config, ref)
+    key = f"{setting_of(spec)} of {parent}"
     together = env.compiled or preset == "smoke"
-    first = dataclasses.replace(config, num_seeds=1)
-    seeds = range(config.seed, _end(config))
-    configs = [config] if together else [dataclasses.replace(first, seed=seed) for seed in seeds]
-    keys = []
-    for i, one in enumerate(configs):
-        parent = jobs[parents[i]] if parents else None
-        ref = None
-        if parent is not None and parent.spec is not None:
-            ref = RunRef(str(parent.path), at or parent.spec.config.steps, parent.key)
-            one = inherit.take_form(one, parent.spec.config)
-            jobs[parent.key] = parent._replace(is_parent=True)
-        job = _job(RunSpec(one, ref), out, parent)
-        known = jobs.get(job.key, job)
-        names = tuple(dict.fromkeys([*known.figures, figure]))
-        jobs[job.key] = known._replace(figures=names, needs_walk=known.needs_walk or needs_walk)
-        keys.append(job.key)
-    return tuple(keys)
+    one = settings.setdefault(key, _Setting(spec, parent, together))
+    seeds = tuple(seeds_of(config))
+    if part is not None:
+        one.wanted.setdefault(figure, set()).update(seeds)
+        one.needs_walk |= part.measure.needs_walk
+        one.needs_returns |= part.measure.needs_returns
+    return key, seeds
 
 
 @functools.cache
@@ -170,20 +192,137 @@ def _made(name: str, obs_noise: float) -> envs.Environment:
     return envs.make(name, obs_noise=obs_noise)
 
 
-def _environment(config: RunConfig) -> envs.Environment:
+def environment(config: RunConfig) -> envs.Environment:
+    """The environment of a configuration, made once for all that ask.
+
+    Raises:
+        ValueError: it cannot be made here.
+    """
     try:
         return _made(config.env, config.obs_noise)
     except (ImportError, RunError) as error:
         raise ValueError(f"env={config.env} cannot be made here: {error}") from error
 
 
-def _job(spec: RunSpec, out: Path, parent: Job | None) -> Job:
+def _take(key: str, settings: Mapping[str, _Setting], runs: Mapping[str, Sequence[Found]]) -> None:
+    """Take the seeds of a setting from the runs that have them, and ask its parent for what the others start from.
+
+    Raises:
+        RunError: one of the plan's own runs is finished and lacks something.
+    """
+    one = settings[key]
+    own, missing = [run for run in runs[key] if _starts_right(run, key, settings, runs)], set(one.seeds)
+    for run in own:
+        seeds = {seed for seed in run.finished() if seed in missing and not _lacks(run, one, seed)}
+        if seeds:
+            one.taken[run] = seeds
+            missing -= seeds
+    from_parent = set(missing)
+    for run in own:
+        seeds = missing & set(run.seeds)
+        if not run.is_own or not seeds:
+            continue
+        for seed in seeds & set(run.finished()):
+            raise RunError(
+                f"{run.path} is finished and has no {_lacks(run, one, seed)}, which {', '.join(one.wanted)} needs. "
+                "What to do: move it away, or give another --out."
+            )
+        one.taken[run] = one.taken.get(run, set()) | seeds
+        missing -= seeds
+        # What is finished has diverged in these seeds; what has a checkpoint goes on from that.
+        if run.status is not Status.PARTIAL or run.directory.checkpoints().steps():
+            from_parent -= seeds
+    one.missing = missing
+    if one.parent is not None and one.spec.parent is not None:
+        for figure, seeds in one.wanted.items():
+            if seeds & from_parent:
+                settings[one.parent].wanted.setdefault(figure, set()).update(seeds & from_parent)
+        for seed in from_parent:
+            settings[one.parent].states.setdefault(seed, set()).add(one.spec.parent.step or 0)
+
+
+def _starts_right(run: Found, key: str, settings: Mapping[str, _Setting], runs: Mapping[str, Sequence[Found]]) -> bool:
+    """Whether a run of a setting starts from a run of the parent that is meant, each seed from the same one."""
+    parent = settings[key].parent
+    if parent is None or run.spec.parent is None:
+        return parent is None
+    theirs = [
+        other.spec.identity
+        for other in runs[parent]
+        if other.seeds[0] == run.seeds[0] and len(other.seeds) >= len(run.seeds)
+        if _starts_right(other, parent, settings, runs)
+    ]
+    return run.spec.parent.identity in (_identity(parent, settings, run.seeds), *theirs)
+
+
+def _identity(key: str, settings: Mapping[str, _Setting], seeds: range) -> str:
+    """The identity that a run of these seeds would have, its parent a run of the same."""
+    one = settings[key]
+    ref = one.spec.parent
+    if one.parent is not None and ref is not None:
+        ref = dataclasses.replace(ref, identity=_identity(one.parent, settings, seeds))
+    return RunSpec(dataclasses.replace(one.spec.config, seed=seeds[0], num_seeds=len(seeds)), ref).identity
+
+
+def _lacks(run: Found, one: _Setting, seed: int) -> str:
+    """What a finished run has not that is needed of a seed; empty: nothing."""
+    if one.needs_walk and not run.directory.has_walk():
+        return "walk"
+    if one.needs_returns and one.spec.config.eval_every and not run.spec.config.eval_every:
+        return "evaluations"
+    gone = one.states.get(seed, set()).difference(run.directory.checkpoints().steps())
+    return f"checkpoint of step {min(gone):,}" if gone else ""
+
+
+def _plan_jobs(key: str, settings: Mapping[str, _Setting], out: Path) -> None:
+    """The jobs of a setting, those of its parent being known: runs that were found, and those that are missing."""
+    one = settings[key]
+    parents = settings[one.parent].jobs if one.parent is not None else []
+    before = f"-from-{settings[one.parent].spec.config.method}" if one.parent is not None else ""
+    for run, seeds in one.taken.items():
+        parent = None
+        if run.status is Status.PARTIAL:
+            parent = next((job.key for job in parents if run.seeds[0] in job.seeds), None)
+        one.jobs.append(_job(run.spec, run.path, before, one, seeds, parent))
+    for group in _groups(one, parents):
+        config, ref = dataclasses.replace(one.spec.config, seed=group[0], num_seeds=len(group)), one.spec.parent
+        parent = next((job for job in parents if group[0] in job.seeds), None)
+        if ref is not None and parent is not None:
+            ref = dataclasses.replace(ref, directory=str(parent.path), identity=parent.key)
+        job = _job(RunSpec(config, ref), None, before, one, one.missing & set(group), parent and parent.key)
+        one.jobs.append(job._replace(path=out / RUNS / job.name))
+    one.jobs.sort(key=lambda job: job.seeds)
+
+
+def _groups(one: _Setting, parents: Sequence[Job]) -> list[range]:
+    """Missing seeds, as the runs that they go in."""
+    missing = sorted(one.missing)
+    if parents:
+        # A seed takes over from the one with its place, so seeds are together as they are in their parent.
+        both = [(seeds_of(job.spec.config), one.missing & set(job.seeds)) for job in parents if job.spec is not None]
+        return [range(theirs[0], max(own) + 1) for theirs, own in both if own]
+    if not one.together:
+        return [range(seed, seed + 1) for seed in missing]
+    if missing and build.draws_itself(one.spec.config.env):
+        return [range(one.spec.config.seed, missing[-1] + 1)]
+    starts = [seed for seed in missing if seed - 1 not in one.missing]
+    ends = [seed + 1 for seed in missing if seed + 1 not in one.missing]
+    return [range(*pair) for pair in zip(starts, ends, strict=True)]
+
+
+def _job(
+    spec: RunSpec, path: Path | None, before: str, one: _Setting, seeds: Collection[int], parent: str | None
+) -> Job:
     config, key = spec.config, spec.identity
-    last = _end(config) - 1
-    seeds = f"seed{last}" if config.num_seeds == 1 else f"seeds{config.seed}-{last}"
-    before = f"-from-{parent.spec.config.method}" if parent is not None and parent.spec is not None else ""
-    name = f"{config.env.replace(':', '-')}-{config.method}{before}-{seeds}-{key[:8]}"
-    return Job(key, name, out / RUNS / name, spec, parent=parent and parent.key)
+    first, last = seeds_of(config)[0], seeds_of(config)[-1]
+    name = f"{config.env.replace(':', '-')}-{config.method}{before}-"
+    name += f"seed{last}-{key[:8]}" if config.num_seeds == 1 else f"seeds{first}-{last}-{key[:8]}"
+    figures = tuple(figure for figure, wanted in one.wanted.items() if wanted & set(seeds))
+    return Job(key, name, path or Path(), spec, parent=parent, figures=figures, seeds=tuple(sorted(seeds)))
+
+
+def _taken(setting: _Setting, seeds: tuple[int, ...]) -> Taken:
+    return Taken(tuple(job.key for job in setting.jobs if set(seeds) & set(job.seeds)), seeds)
 
 
 def _testbed(testbed: Testbed, preset: str, out: Path, figure: str) -> Job:
@@ -196,66 +335,32 @@ def _testbed(testbed: Testbed, preset: str, out: Path, figure: str) -> Job:
 # Where jobs stand.
 
 
-def find(places: Iterable[Path], wanted: Collection[str]) -> dict[str, Path]:
-    """Finished runs in directories of runs, of these identities: identity -> where. What is damaged there is passed
-    over.
-    """
-    found = {}
-    for path in runs_in(places):
-        directory = RunDirectory(path)
-        with contextlib.suppress(RunError, ValueError):
-            identity = directory.spec().identity
-            if identity in wanted and directory.status() is Status.FINISHED:
-                found.setdefault(identity, path)
-    return found
-
-
-def runs_in(places: Iterable[Path]) -> Iterator[Path]:
-    """What lies in directories of runs; of several seeds' runs each."""
-    for place in places:
-        for path in sorted(place.iterdir()) if place.is_dir() else []:
-            with contextlib.suppress(RunError, ValueError):
-                yield from expand(path)
-
-
-def look(job: Job, finished: Mapping[str, Path] | None = None) -> Standing:
-    """Where a job stands: in its own directory, or finished elsewhere.
-
-    A run that was only kept has no checkpoints, and stands in for no parent; nor where a walk is needed that it lacks.
-
-    Args:
-        job: of a plan.
-        finished: runs elsewhere (`find`).
+def look(job: Job) -> Standing:
+    """Where a job stands.
 
     Raises:
         RunError: its directory holds another run, or cannot be read.
         ValueError: its configuration is damaged.
     """
     if job.spec is None:
-        return Standing(State.FINISHED if _is_whole(job.path) else State.TO_DO, 0, job.path)
+        return Standing(State.FINISHED if _is_whole(job.path) else State.TO_DO, 0)
     config, directory = job.spec.config, RunDirectory(job.path)
     status = directory.status()
     if status is not Status.ABSENT:
         found = directory.spec()
-        if job.parent is None and found.identity != job.key:
+        if found.identity != job.key:
             raise RunError(
                 f"{job.path} holds a run of other settings (identity {found.identity}, and the plan's is {job.key}). "
                 "What to do: move it away, or give another --out."
             )
     if status is Status.FINISHED:
-        return Standing(State.FINISHED, config.steps, job.path)
-    elsewhere = (finished or {}).get(job.key)
-    if elsewhere is not None:
-        other = RunDirectory(elsewhere)
-        lacks_state, lacks_walk = job.is_parent and other.is_kept(), job.needs_walk and not other.has_walk()
-        if not lacks_state and not lacks_walk:
-            return Standing(State.FINISHED, config.steps, elsewhere)
+        return Standing(State.FINISHED, config.steps)
     row = last_row(directory.metrics_path)
     step = row["step"] if row else 0
     if status is Status.DIVERGED:
-        what = (row or {}).get("diverged")
-        return Standing(State.DIVERGED, step, job.path, f"not finite was {what}")
-    return Standing(State.PARTIAL if status is Status.PARTIAL else State.TO_DO, step, job.path)
+        what = " and ".join(dict.fromkeys(str(how["what"]) for how in directory.diverged().values()))
+        return Standing(State.DIVERGED, step, f"not finite was {what or (row or {}).get('diverged')}")
+    return Standing(State.PARTIAL if status is Status.PARTIAL else State.TO_DO, step)
 
 
 def _is_whole(path: Path) -> bool:
@@ -271,10 +376,14 @@ def step_of(job: Job) -> int:
     return row["step"] if row else 0
 
 
-def look_all(plan: Plan, places: Iterable[Path] = ()) -> dict[str, Standing]:
-    """Where all jobs of a plan stand; `places` are directories of other runs. Raises as `look`."""
-    finished = find(places, plan.jobs)
-    return {key: look(job, finished) for key, job in plan.jobs.items()}
+def look_all(plan: Plan) -> dict[str, Standing]:
+    """Where all jobs of a plan stand. Raises as `look`."""
+    return {key: look(job) for key, job in plan.jobs.items()}
+
+
+def open_jobs(plan: Plan, standings: Mapping[str, Standing]) -> list[Job]:
+    """Those that are still to be done, or to be finished."""
+    return [plan.jobs[key] for key, one in standings.items() if one.state in (State.TO_DO, State.PARTIAL)]
 
 
 def command(job: Job) -> list[str]:
@@ -341,169 +450,31 @@ def check_out(out: Path, preset: str) -> None:
         raise RunError(f"--out={out} holds other files ({', '.join(sorted(there)[:3])}). Give another directory.")
 
 
-def write_settings(plan: Plan, standings: Mapping[str, Standing]) -> None:
-    """Make the plan's directory, with the settings of every run; parents are where they were found.
+def write_record(plan: Plan) -> None:
+    """Make the plan's directory a paper's: with its record, later commands know it for one.
 
     Raises:
         RunError: it cannot be written.
     """
     try:
         plan.out.mkdir(parents=True, exist_ok=True)
-        # First: with it, the directory is a paper's.
         write_text(plan.out / RECORD, json.dumps({"format": 1, "preset": plan.preset}) + "\n")
-        for name in (RUNS, SETTINGS, LOGS, TESTBEDS):
-            (plan.out / name).mkdir(exist_ok=True)
-        for job in plan.jobs.values():
-            if job.spec is not None:
-                spec = job.spec
-                if spec.parent is not None and job.parent is not None:
-                    ref = dataclasses.replace(spec.parent, directory=str(standings[job.parent].path.absolute()))
-                    spec = dataclasses.replace(spec, parent=ref)
-                write_text(settings_of(job), to_json(spec))
     except OSError as error:
         raise disk_error("start the paper", plan.out, error, "start it again") from error
 
 
-# What it will take.
-
-
-class Size(NamedTuple):
-    """What a job needs, in bytes."""
-
-    memory: int
-    disk: int
-
-
-def size(job: Job) -> Size:
-    """Memory of a job's process and what it leaves on the disk, as estimates from above.
-
-    Of the paper's preset the state is traced. Of the small ones it is what was seen, and the transitions it keeps.
-    """
-    if job.spec is None:
-        return Size(PROCESS, 2**20)
-    config = job.spec.config
-    state = config.num_seeds * (_traced(_unseeded(config)) if config.preset == "paper" else _usual(config))
-    rounds = math.ceil(config.steps / config.explorer.steps_per_round)
-    checkpoints = 3 + len(config.keep_at)
-    return Size(PROCESS + PER_STATE * state, checkpoints * state + config.num_seeds * rounds * ROW)
-
-
-def _usual(config: RunConfig) -> int:
-    spec = _environment(config).spec
-    return STATE + 4 * config.explorer.data_capacity * (2 * spec.obs_size + spec.action_size + 3)
-
-
-def _unseeded(config: RunConfig) -> RunConfig:
-    return dataclasses.replace(config, seed=0, num_seeds=1, eval_every=0)
-
-
-@functools.cache
-def _traced(config: RunConfig) -> int:
-    env = build.make_env(config)
-    leaves = jax.tree.leaves(make_programs(config, env, build.make_agent(config, env)).trace_init())
-    return sum(leaf.size * getattr(leaf.dtype, "itemsize", 8) for leaf in leaves)
-
-
-def check_disk(plan: Plan, standings: Mapping[str, Standing]) -> None:
-    """Refuse a plan that is larger than what is left of the disk.
+def write_settings(plan: Plan, standings: Mapping[str, Standing]) -> None:
+    """Make the plan's directory, with the settings of every run that is still to be done.
 
     Raises:
-        ValueError: says what it needs and what there is.
+        RunError: it cannot be written.
     """
-    todo = [plan.jobs[key] for key, one in standings.items() if one.state in (State.TO_DO, State.PARTIAL)]
-    need = sum(size(job).disk for job in todo)
-    place = next(path for path in (plan.out.resolve(), *plan.out.resolve().parents) if path.exists())
-    free = shutil.disk_usage(place).free
-    if need > free:
-        raise ValueError(
-            f"--out={plan.out}: {len(todo)} runs need {need / 2**30:,.1f} GiB of disk at the most, and there are "
-            f"{free / 2**30:,.1f} GiB. Allowed: fewer figures, a smaller --preset, or an --out on a larger disk."
-        )
-
-
-Rates = Mapping[tuple[str, str, str], float]
-"""Environment, method and preset -> seconds for a step of a seed."""
-
-
-def rates(runs: Iterable[Path], plan: Plan | None = None) -> dict[tuple[str, str, str], float]:
-    """What a step has taken in runs of before, by environment, method and preset: medians. What is damaged is passed
-    over.
-
-    Args:
-        runs: directories.
-        plan: whose methods are asked for; None: all.
-    """
-    specs = [job.spec for job in plan.jobs.values()] if plan is not None else []
-    wanted = {(spec.config.env, spec.config.method) for spec in specs if spec is not None}
-    found: dict[tuple[str, str, str], list[float]] = {}
-    for path in runs:
-        directory = RunDirectory(path)
-        try:
-            raw = read_json(path / "config.json")
-            if plan is not None and (raw.get("env"), raw.get("method")) not in wanted:
-                continue
-            rows = directory.rows() if directory.is_kept() else [last_row(directory.metrics_path)]
-            config, row = directory.config(), rows[-1] if rows else None
-        except (RunError, ValueError, OSError):
-            continue
-        if row and row.get("wall_time") and row["step"] > config.explorer.warm_up_steps:
-            seconds = row["wall_time"] / row["step"] / config.num_seeds
-            found.setdefault((config.env, config.method, config.preset), []).append(seconds)
-    return {key: sorted(values)[len(values) // 2] for key, values in found.items()}
-
-
-def seconds_left(job: Job, standing: Standing, known: Rates) -> float | None:
-    """How long a job still takes, from runs of before; None: there is none of its environment, method and preset."""
-    if standing.state in (State.FINISHED, State.DIVERGED):
-        return 0.0
-    if job.spec is None:
-        return None
-    config = job.spec.config
-    rate = known.get((config.env, config.method, config.preset))
-    return None if rate is None else rate * config.num_seeds * (config.steps - standing.step)
-
-
-def describe(plan: Plan, standings: Mapping[str, Standing], known: Rates, at_a_time: int | None = None) -> str:
-    """The plan as text: a line for the seeds of each setting, with the estimates of what is left."""
-    groups: dict[tuple[Any, ...], list[Job]] = {}
-    for job in plan.jobs.values():
-        what = job.name if job.spec is None else job.name.rpartition("-seed")[0]
-        settings = _settings_key(job.spec) if job.spec is not None else None
-        groups.setdefault((what, settings, job.figures), []).append(job)
-    head = ("run", "seeds", "steps", "state", "time left", "memory each", "figures")
-    lines, total, unknown, largest = [], 0.0, 0, 0
-    for (what, _, figures), jobs in groups.items():
-        left = [seconds_left(job, standings[job.key], known) for job in jobs]
-        need = size(jobs[0]).memory
-        todo = [job for job in jobs if standings[job.key].state in (State.TO_DO, State.PARTIAL)]
-        total += sum(one or 0.0 for one in left)
-        unknown += sum(one is None for one in left)
-        largest = max(largest, need if todo else 0)
-        counts = {state: sum(standings[job.key].state is state for job in jobs) for state in State}
-        seeds = [seed for job in jobs for seed in job.seeds]
-        steps = "-" if jobs[0].spec is None else f"{jobs[0].spec.config.steps:,}"
-        there = {one.value: count for one, count in counts.items() if count}
-        state = ", ".join(f"{count} {name}" if len(jobs) > 1 else name for name, count in there.items())
-        time = "no run to tell from" if any(one is None for one in left) else duration(sum(one or 0.0 for one in left))
-        seen = f"{min(seeds)} to {max(seeds)}" if seeds else "-"
-        lines.append((what, seen, steps, state, time, f"{need / 2**30:.1f} GiB", ", ".join(figures)))
-    states = [one.state for one in standings.values()]
-    done = states.count(State.FINISHED)
-    text = [
-        f"{len(plan.figures)} figures, preset {plan.preset}: {len(plan.jobs)} runs, {done} of them finished, "
-        f"{states.count(State.PARTIAL)} partial, {states.count(State.DIVERGED)} diverged",
-        markdown_table(head, lines),
-    ]
-    text += [f"{plan.jobs[key].name} diverged: {one.reason}" for key, one in standings.items() if one.reason]
-    if len(plan.jobs) > done:
-        side = f", {at_a_time} at a time: {duration(total / at_a_time)}" if at_a_time else ""
-        parts = [f"{duration(total)} of computing{side}"] if total else []
-        parts += [f"{unknown} runs of a kind that has not been run here, so their time is not known"] if unknown else []
-        text.append(f"left: {'; '.join(parts)}; up to {largest / 2**30:.1f} GiB of memory each")
-    return "\n\n".join(text)
-
-
-def _settings_key(spec: RunSpec) -> str:
-    """The identity that all seeds of a setting would share."""
-    parent = dataclasses.replace(spec.parent, directory="", identity="") if spec.parent is not None else None
-    return RunSpec(dataclasses.replace(spec.config, seed=0), parent).identity
+    write_record(plan)  # First: with it, the directory is a paper's.
+    try:
+        for name in (RUNS, SETTINGS, LOGS, TESTBEDS):
+            (plan.out / name).mkdir(exist_ok=True)
+        for job in open_jobs(plan, standings):
+            if job.spec is not None:
+                write_text(settings_of(job), to_json(job.spec))
+    except OSError as error:
+        raise disk_error("start the paper", plan.out, error, "start it again") from error

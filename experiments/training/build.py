@@ -15,6 +15,13 @@ from jaxplore.methods import get_method
 from jaxplore.validate import FieldError
 
 
+def draws_itself(env: str) -> bool:
+    """Whether an environment draws something of its own once and for all, from a run's first seed: seeds carried side
+    by side share it.
+    """
+    return "seed" in inspect.signature(envs.find_factory(env)).parameters
+
+
 def make_env(config: RunConfig) -> Environment:
     """The environment that a configuration names.
 
@@ -24,7 +31,7 @@ def make_env(config: RunConfig) -> Environment:
     Raises:
         FieldError: the environment refuses an option, or is to be evaluated without a task.
     """
-    own = {"seed": config.seed} if "seed" in inspect.signature(envs.find_factory(config.env)).parameters else {}
+    own = {"seed": config.seed} if draws_itself(config.env) else {}
     env = envs.make(config.env, backend=config.backend, obs_noise=config.obs_noise, **own)
     if config.coverage_dims:
         env = dataclasses.replace(env, coverage=coverage.make_entries_coverage(env.spec, config.coverage_dims))

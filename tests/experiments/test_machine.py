@@ -1,5 +1,6 @@
 import os
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -33,3 +34,18 @@ def test_memory_is_what_the_machine_and_the_container_have_left(system: Path):
     (system / "memory.max").write_text("2000000\n")
     (system / "memory.stat").write_text("anon 1000000\ninactive_file 300000\n")
     assert machine.free_memory() == 800_000
+
+
+def test_what_computes_here_in_words(system: Path, monkeypatch: pytest.MonkeyPatch):
+    (system / "cpuinfo").write_text("processor\t: 0\nmodel name\t: AMD EPYC 7763\nmodel name\t: another\n")
+    monkeypatch.setattr(machine, "CPUINFO", system / "cpuinfo")
+    monkeypatch.setattr(machine.platform, "system", lambda: "Linux")
+    monkeypatch.setattr(machine.platform, "machine", lambda: "x86_64")
+    assert machine.describe() == "AMD EPYC 7763, 16 cores, Linux x86_64"
+
+    class Device(NamedTuple):
+        platform: str
+        device_kind: str
+
+    monkeypatch.setattr(machine.jax, "devices", lambda: [Device("gpu", "NVIDIA H200")] * 2)
+    assert machine.describe() == "2 x NVIDIA H200, AMD EPYC 7763, 16 cores, Linux x86_64"

@@ -6,7 +6,8 @@ import numpy as np
 
 from envs.base import FloorPlan
 
-Verdict = Literal["holds", "does not hold", "undecided", "not run"]
+Verdict = Literal["holds", "does not hold", "undecided", "not run", "not asked"]
+"""`undecided`: conditions were asked, and so few seeds do not tell; `not asked`: there are none."""
 
 
 class Series(NamedTuple):
@@ -30,6 +31,11 @@ class Panel(NamedTuple):
     steps_label: str = "environment steps"
     ceiling: float | None = None
     """What the values cannot exceed, drawn as a line."""
+
+    @property
+    def column(self) -> str:
+        """What the CSV calls the steps."""
+        return "step" if self.steps_label == "environment steps" else slug(self.steps_label)
 
 
 class FloorVisits(NamedTuple):

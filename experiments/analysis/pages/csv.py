@@ -12,12 +12,14 @@ from experiments.analysis.pages.contents import FloorVisits, Panel
 
 
 def text(panel: Panel | FloorVisits) -> str:
-    """Curves as `series,seed,step,value`, an empty value where there is none; visits as `seed,x,y` in metres."""
+    """Curves as `series,seed,step,value`, or what they run over in place of steps, such as `episodes`; an empty value
+    where there is none. Visits as `seed,x,y` in metres.
+    """
     if isinstance(panel, FloorVisits):
         positions = np.asarray(panel.positions, float).tolist()
         seeds = np.asarray(panel.seeds).tolist()
         return _lines(("seed", "x", "y"), ((seed, *map(_value, at)) for seed, at in zip(seeds, positions, strict=True)))
-    return _lines(("series", "seed", "step", "value"), _curves(panel))
+    return _lines(("series", "seed", panel.column, "value"), _curves(panel))
 
 
 def _curves(panel: Panel) -> Iterable[tuple[Any, ...]]:

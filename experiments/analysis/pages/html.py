@@ -112,6 +112,7 @@ def _curves(panel: Panel, name: str, file: str) -> str:
     data = {
         **svg.geometry(frame, x, y),
         "csv": file,
+        "column": panel.column,
         "series": [
             {
                 "label": one.label,

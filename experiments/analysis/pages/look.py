@@ -44,7 +44,7 @@ section{border-top:2px solid var(--rim);margin-top:32px;padding-top:20px}
 .verdict{display:inline-block;border:1.5px solid;border-radius:4px;padding:0 .45em;font-size:.875rem;font-weight:600;
 white-space:nowrap}
 .holds{color:var(--yes)}.does-not-hold{color:var(--no)}.undecided{color:var(--open);border-style:dashed}
-.not-run{color:var(--soft);border-style:dotted}
+.not-run,.not-asked{color:var(--soft);border-style:dotted}
 dl{display:grid;grid-template-columns:max-content 1fr;gap:.3em 1em;margin:.8em 0}
 dt{color:var(--soft)}dd{margin:0;min-width:0}
 @media (max-width:520px){dl{grid-template-columns:1fr;gap:0}dd{margin-bottom:.5em}}
@@ -233,7 +233,8 @@ const curves = (figure, data) => {
   };
   each.addEventListener("change", seeds);
   if (each.checked) seeds();
-  figure.querySelector(".save").addEventListener("click", () => save(data.csv, [["series", "seed", "step", "value"],
+  figure.querySelector(".save").addEventListener("click", () => save(data.csv, [
+    ["series", "seed", data.column, "value"],
     ...data.series.flatMap(one => one.values.flatMap((line, s) =>
       line.map((v, t) => [one.label, one.seeds[s], one.steps[t], v === null ? "" : v])))]));
 };

@@ -6,7 +6,7 @@ from experiments.analysis.pages import curves, floor
 from experiments.analysis.pages.contents import FloorVisits, Report, Section, Table, panel_names, slug
 from experiments.analysis.tables import markdown_table
 
-MARKS = {"holds": "✓", "does not hold": "✗", "undecided": "?", "not run": "o"}
+MARKS = {"holds": "✓", "does not hold": "✗", "undecided": "?", "not run": "o", "not asked": "-"}
 """In front of each verdict, so that colour is not needed."""
 
 

@@ -248,6 +248,14 @@ def test_csv_round_trip(tmp_path: Path):
     assert [line["seed"] for line in lines[::10]] == ["0", "1", "2"]
 
 
+def test_the_csv_says_what_its_curves_run_over(tmp_path: Path):
+    episodes = page.Panel("p", "m", [series()], "episodes")
+    reader = read(tmp_path, report(section(panels=[episodes])))
+    assert (tmp_path / "csv" / "figure_5.csv").read_text(encoding="utf-8").startswith("series,seed,episodes,value\n")
+    data = json.loads(next(text for attributes, text in reader.all("script") if attributes.get("type")))
+    assert data["column"] == "episodes"
+
+
 def test_visits_are_counted_by_square_and_by_cell(tmp_path: Path):
     reader = read(tmp_path, report())
     data = json.loads([text for attributes, text in reader.all("script") if attributes.get("type")][1])

@@ -1,6 +1,6 @@
 import pytest
 
-from experiments.analysis.tables import number
+from experiments.analysis.tables import number, spans
 
 
 @pytest.mark.parametrize(
@@ -9,3 +9,8 @@ from experiments.analysis.tables import number
 )
 def test_numbers_never_turn_into_powers_of_ten_below_a_million(value, want):
     assert number(value) == want
+
+
+def test_whole_numbers_as_ranges():
+    assert spans([27, 20, 21, 22, 21]) == "20 to 22, 27"
+    assert spans({5: 1.0}) == "5" and spans([]) == ""

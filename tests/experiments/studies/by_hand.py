@@ -13,6 +13,7 @@ from experiments.runs.scene import Cells, Scene
 from experiments.runs.schedule import rounds
 from experiments.runs.spec import RunSpec
 from experiments.runs.status import Status
+from experiments.studies.estimates import Rates
 from experiments.studies.figures_of_paper import Cell, Figure, Part
 from experiments.studies.plan import Job
 
@@ -40,7 +41,10 @@ def finish(job: Job, cells: Mapping[int, int] | None = None, path: Path | None =
     return write(job.spec, path or job.path, cells, value)
 
 
-def write(spec: RunSpec, path: Path, cells: Mapping[int, int] | None = None, value: float = 1.0) -> Path:
+def write(
+    spec: RunSpec, path: Path, cells: Mapping[int, int] | None = None, value: float = 1.0, pace: float = 0.01
+) -> Path:
+    """Write a finished run, `pace` seconds a step."""
     config, directory = spec.config, RunDirectory(path)
     directory.begin(spec, SCENE)
     log = directory.metrics_log()
@@ -49,7 +53,7 @@ def write(spec: RunSpec, path: Path, cells: Mapping[int, int] | None = None, val
         for seed in range(config.seed, config.seed + config.num_seeds):
             seen = (cells or {}).get(seed, 2)
             seen = seen if 2 * step > config.steps else seen // 2
-            row = {"step": step, "seed": seed, "coverage": seen / 4, "cells": seen, "wall_time": 0.01 * step}
+            row = {"step": step, "seed": seed, "coverage": seen / 4, "cells": seen, "wall_time": pace * step}
             lines.append({**row, "variance": value, "episode_return": value * (seed + 1)})
         log.append(lines)
     log.close()
@@ -59,7 +63,7 @@ def write(spec: RunSpec, path: Path, cells: Mapping[int, int] | None = None, val
     return path
 
 
-LONG = dict.fromkeys(("smoke", "laptop", "paper"), 2_000)
+LONG = dict.fromkeys(("smoke", "laptop", "paper"), 10_000)
 SMALL_CELLS = tuple(
     Cell(
         f"noise {noise}",
@@ -72,7 +76,9 @@ SMALL_CELLS = tuple(
     for noise in (0.0, 0.1, 0.2)
 )
 SMALL = figure("small", SMALL_CELLS)
-"""Of random actions, which compile in no time."""
+"""Of random actions, which compile in no time; long enough to be killed often."""
 
 
-__all__ = ["COVERAGE", "RETURN", "SMALL", "VISITS", "WHOLE", "cell", "figure", "finish", "write"]
+NO_RATES = Rates({}, {})
+
+__all__ = ["COVERAGE", "NO_RATES", "RETURN", "SMALL", "VISITS", "WHOLE", "cell", "figure", "finish", "write"]

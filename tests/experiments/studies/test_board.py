@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from experiments.studies import board, plan
+from experiments.studies.estimates import Rates
 from experiments.studies.plan import State
-from tests.experiments.studies.by_hand import cell, figure
+from tests.experiments.studies.by_hand import NO_RATES, cell, figure
 
 
 @pytest.fixture
@@ -18,7 +19,7 @@ def test_a_line_for_each_at_work_and_one_for_all(made: plan.Plan, monkeypatch: p
     stream, clock = io.StringIO(), itertools.count(0.0, 0.25)
     monkeypatch.setattr(board.time, "monotonic", lambda: next(clock))
     monkeypatch.setenv("COLUMNS", "200")
-    shown = board.Board(made, {("ant_maze", "random", "laptop"): 0.1}, 2, stream=stream, live=True)
+    shown = board.Board(made, Rates({}, {("ant_maze", "random", "laptop"): 0.1}), 2, stream=stream, live=True)
     first, second, third = made.jobs
     now = plan.look_all(made)
     shown.update(now, [first, second], {}, 1)
@@ -35,7 +36,7 @@ def test_a_line_for_each_at_work_and_one_for_all(made: plan.Plan, monkeypatch: p
 def test_a_runs_own_pace_is_taken_once_it_has_one(made: plan.Plan, monkeypatch: pytest.MonkeyPatch):
     stream, now = io.StringIO(), [0.0]
     monkeypatch.setattr(board.time, "monotonic", lambda: now[0])
-    shown = board.Board(made, {}, 2, stream=stream, live=True)
+    shown = board.Board(made, NO_RATES, 2, stream=stream, live=True)
     first = next(iter(made.jobs))
     standings = plan.look_all(made)
     # The first round waits for the compiler; after it 50 steps take 10 s, so that the last 150 take 30 s.
@@ -48,7 +49,7 @@ def test_a_runs_own_pace_is_taken_once_it_has_one(made: plan.Plan, monkeypatch: 
 
 def test_plain_lines_elsewhere(made: plan.Plan):
     stream = io.StringIO()
-    shown = board.Board(made, {}, 2, stream=stream, live=False)
+    shown = board.Board(made, NO_RATES, 2, stream=stream, live=False)
     now = plan.look_all(made)
     for _ in range(3):
         shown.update(now, list(made.jobs)[:2], {}, 1)
@@ -57,7 +58,7 @@ def test_plain_lines_elsewhere(made: plan.Plan):
 
 def test_a_worker_that_was_lost_is_said(made: plan.Plan):
     stream = io.StringIO()
-    shown = board.Board(made, {}, 2, stream=stream, live=False)
+    shown = board.Board(made, NO_RATES, 2, stream=stream, live=False)
     first = next(iter(made.jobs))
     shown.again(first, "its Slurm job 7 went away (cancelled).")
     said = f"{made.jobs[first].name}: its Slurm job 7 went away (cancelled); it goes on from its latest checkpoint\n"

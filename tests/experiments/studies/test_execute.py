@@ -76,7 +76,12 @@ def test_so_many_at_a_time_and_how_each_ended(tmp_path: Path):
     assert {key: end.status for key, end in ended.items()} == {0: 0, 1: 1, 2: -9, 3: 7, 4: 130}
     assert ended[0] == End(0, None)
     assert ended[1].error == "the disk is full"
-    assert str(ended[2].error).startswith("it was ended by SIGKILL, perhaps because memory was short")
+    # `run`, whose seeds these are, has a flag for that; a paper's plan has none.
+    killed = "it was ended by SIGKILL, perhaps because memory was short"
+    assert ended[2].error == f"{killed}: give fewer --processes"
+    one = execute.start(Job(0, ["-c", "import os; os.kill(os.getpid(), 9)"], tmp_path / "paper.log"), {})
+    one.popen.wait()
+    assert execute.end(one).error == killed
     assert ended[3].error == "exit status 7 after: what?"
     assert ended[4].error == "it was stopped"
     assert (tmp_path / "4.log").read_text() == "so\n"

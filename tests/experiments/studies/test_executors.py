@@ -3,7 +3,9 @@
 import os
 import shutil
 import signal
+import sys
 import time
+import types
 from pathlib import Path
 
 import pytest
@@ -143,6 +145,51 @@ def test_a_cluster_out_of_reach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(RunError, match=r"--executor=slurm: .*What to do: start it where sbatch works"):
         executors.slurm(tmp_path / "workers", MEMORY, {})
+
+
+class FakeSubmitit(types.ModuleType):
+    """As much of submitit as there is without a cluster: `sbatch` refuses, and nothing answers."""
+
+    class AutoExecutor:
+        def __init__(self, folder: str, cluster: str) -> None: ...
+
+        def update_parameters(self, **parameters) -> None: ...
+
+        def submit(self, *task):
+            raise RuntimeError("sbatch: error: Batch job submission failed: Invalid account\nmore of it")
+
+
+@pytest.fixture
+def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder for the commands of a Slurm that there is not."""
+    monkeypatch.setitem(sys.modules, "submitit", FakeSubmitit("submitit"))
+    monkeypatch.setenv("PATH", str(tmp_path / "bin"))
+    (tmp_path / "bin").mkdir()
+    return tmp_path / "bin"
+
+
+def command(folder: Path, name: str, script: str) -> None:
+    (folder / name).write_text(f"#!/bin/sh\n{script}\n")
+    (folder / name).chmod(0o755)
+
+
+def test_a_controller_that_does_not_answer(cluster: Path, tmp_path: Path):
+    with pytest.raises(RunError, match=r"--executor=slurm: .*sinfo.*\. What to do: start it where sbatch works"):
+        executors.slurm(tmp_path / "workers", MEMORY, {})
+    command(cluster, "sinfo", "echo 'slurm_load_partitions: Unable to contact slurm controller' >&2; exit 1")
+    with pytest.raises(RunError, match=r"slurm: slurm_load_partitions: Unable to contact slurm controller\. What"):
+        executors.slurm(tmp_path / "workers", MEMORY, {})
+    assert not (tmp_path / "workers").exists()
+
+
+def test_what_sbatch_refuses_is_a_line_of_the_run(cluster: Path, tmp_path: Path):
+    command(cluster, "sinfo", "exit 0")
+    executor = executors.slurm(tmp_path / "workers", MEMORY, {})
+    made = plan.make([by_hand.figure("a", (CELL,))], "smoke", tmp_path / "out")
+    outcome = conduct.carry_out(made, plan.look_all(made), executor, lambda *_: None)
+    assert list(outcome.failed.values()) == [
+        "Slurm has not taken it: sbatch: error: Batch job submission failed: Invalid account"
+    ]
 
 
 def test_a_ray_cluster_out_of_reach(monkeypatch: pytest.MonkeyPatch):

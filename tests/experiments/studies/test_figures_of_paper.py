@@ -2,6 +2,7 @@ import dataclasses
 
 import pytest
 
+from experiments.analysis.verdicts import Numbers
 from experiments.runs.config import PRESETS, RunConfig
 from experiments.runs.inherit import form_of
 from experiments.studies import figures_of_paper
@@ -29,8 +30,16 @@ def test_every_cell_makes_a_configuration(preset: str):
     for cell in cells:
         config = config_of(cell, preset)
         assert (config.env, config.method, config.preset) == (cell.env, cell.method, preset)
-        assert config.num_seeds == (2 if preset == "smoke" else cell.seeds)
+        many = preset == "laptop" and cell.by_preset["laptop"].get("num_seeds")
+        assert config.num_seeds == (2 if preset == "smoke" else many or cell.seeds)
         assert config.seed == (20 if preset == "laptop" else 0)
+
+
+def test_the_laptops_acrobot_and_maze_have_ten_seeds():
+    for name in ("acrobot", "ant_coverage", "ant_reward", "ant_visits"):
+        for cell in figures()[name].parts[0].cells:
+            laptop, paper = config_of(cell, "laptop"), config_of(cell, "paper")
+            assert (laptop.seed, laptop.num_seeds, paper.num_seeds) == (20, 10, 5)
 
 
 def test_the_papers_seeds_and_steps():
@@ -78,9 +87,23 @@ def test_rnd_is_paid_for_the_task_on_the_cheetah_and_not_in_the_maze():
 def test_conditions_ask_for_labels_that_there_are():
     for figure in figures().values():
         for condition in figure.conditions:
-            labels = {cell.label for cell in figure.parts[condition.part].cells}
-            scores = {label: {0: 1.0, 1: 2.0} for label in labels}
-            assert condition.decide(scores)[0] != "not run", (figure.name, condition.text)
+            beliefs = condition.part == len(figure.parts)
+            cells = figure.testbeds if beliefs else figure.parts[condition.part].cells
+            found = {cell.label: {0: 1.0, 1: 2.0} for cell in cells}
+            assert condition.decide(Numbers(found, "", found, found, found))[0] != "not run", condition.text
+
+
+def test_conditions_ask_what_the_claims_say():
+    texts = {name: [one.text for one in figure.conditions] for name, figure in figures().items()}
+    assert all(texts.values())
+    assert {f"{one} at 100% on every seed" for one in ("implicit", "max")} <= set(texts["chain"])
+    assert {f"max ahead of {one}" for one in ("icm", "disagreement")} <= set(texts["chain"])
+    assert sum("at 100% on every seed" in text for text in texts["acrobot"]) == 4
+    assert "implicit at 100% on every seed" in texts["ant_coverage"]
+    rises, falls = texts["ant_reward"][:2]
+    assert rises.startswith("implicit higher later") and falls.startswith("max lower in the second half")
+    # No more than half of the hand's rotations can be reached, so that none sees half of them is no finding.
+    assert not any("or less" in text for text in texts["hand"]) and "256" in figures()["hand"].unasked
 
 
 def test_the_table_prints_what_the_paper_prints():

@@ -1,5 +1,6 @@
 """Twenty kills, of workers and of the planner, at random moments: the same report in the end."""
 
+import json
 import os
 import subprocess
 import sys
@@ -10,7 +11,7 @@ import pytest
 from experiments.analysis.page import Panel
 from experiments.studies import figures_of_paper, plan, report
 from experiments.studies.plan import State
-from tests.experiments.studies.by_hand import SMALL
+from tests.experiments.studies.by_hand import NO_RATES, SMALL
 from tests.experiments.tiny import ROOT, rows
 
 KILLS = int(os.environ.get("KILLS", "20"))
@@ -18,7 +19,7 @@ WORDS = ("small", "--preset=smoke", "--import=tests.experiments.studies.small_pa
 
 # Forks planners that have everything imported, and kills them or one of their workers, which are processes.
 LAUNCHER = """
-import os, pathlib, random, signal, sys, time
+import json, os, pathlib, random, signal, sys, time
 from experiments import paper
 
 out, kills, words = pathlib.Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3:]
@@ -43,19 +44,25 @@ def workers():
 
 pid, ends, killed = planner(), [], {"planner": 0, "worker": 0}
 while sum(killed.values()) < kills:
-    time.sleep(draw.uniform(0.5, 8.0))
-    done, status = os.waitpid(pid, os.WNOHANG)
+    # A worker takes its time to start, and there must be one to be killed.
+    victim, done = "worker" if draw.random() < 0.6 else "planner", 0
+    while not done and victim == "worker" and not workers():
+        time.sleep(0.1)
+        done, status = os.waitpid(pid, os.WNOHANG)
+    time.sleep(draw.uniform(0.1, 3.0 if victim == "worker" else 12.0))
+    if not done:
+        done, status = os.waitpid(pid, os.WNOHANG)
     if done:
         ends.append(os.waitstatus_to_exitcode(status))
         break
     running = workers()
-    if running and draw.random() < 0.6:
+    if running and victim == "worker":
         try:
             os.kill(draw.choice(running), signal.SIGKILL)
             killed["worker"] += 1
         except ProcessLookupError:
             pass
-    else:
+    elif victim == "planner":
         os.kill(pid, signal.SIGKILL)
         os.waitpid(pid, 0)
         killed["planner"] += 1
@@ -63,7 +70,7 @@ while sum(killed.values()) < kills:
 else:
     _, status = os.waitpid(pid, 0)
     ends.append(os.waitstatus_to_exitcode(status))
-print(killed, ends)
+print(json.dumps(killed), ends)
 sys.exit(ends[-1])
 """
 
@@ -77,6 +84,9 @@ def test_twenty_kills(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     done = subprocess.run(killing, cwd=ROOT, capture_output=True, text=True, timeout=3_000)
     assert done.returncode == 0, done.stdout + done.stderr
     print(done.stdout)
+    killed = json.loads(done.stdout[done.stdout.index("{") : done.stdout.index("}") + 1])
+    assert sum(killed.values()) == KILLS, f"the plan was finished after {killed}"
+    assert KILLS < 20 or min(killed.values()) >= 5, killed
     command = [sys.executable, "-m", "experiments.paper", *WORDS, f"--out={whole}"]
     assert subprocess.run(command, cwd=ROOT, capture_output=True, timeout=3_000).returncode == 0
     assert told(out) == told(whole)
@@ -91,7 +101,7 @@ def told(out: Path) -> list:
     made = plan.make([SMALL], "smoke", out)
     standings = plan.look_all(made)
     assert {one.state for one in standings.values()} == {State.FINISHED}
-    found = report.make(made, standings, {}, {})
+    found = report.make(made, standings, {}, NO_RATES)
     said: list = [found.title, found.notes]
     for section in found.sections:
         said += [section.verdict, section.explanation, section.tables]
