@@ -107,7 +107,7 @@ def init(parts: TreeSearch, key: Key) -> PlanningState:
 
 def improve(parts: TreeSearch, key: Key, state: PlanningState, experience: Experience) -> tuple[PlanningState, Metrics]:
     """Ask the round's models about all states and actions."""
-    belief, models, normalizers, score = world_of(parts.signal, experience)
+    belief, models, normalizers, score, _ = world_of(parts.signal, experience)
     pairs = (parts.num_states, parts.num_actions)
     obs = jnp.repeat(jnp.eye(parts.num_states), parts.num_actions, axis=0)
     action = jnp.tile(jnp.eye(parts.num_actions), (parts.num_states, 1))
