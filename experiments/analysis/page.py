@@ -6,6 +6,7 @@ from experiments.analysis.pages import csv, html, markdown, picture
 from experiments.analysis.pages.contents import (
     FloorVisits,
     Panel,
+    Reason,
     Report,
     Section,
     Series,
@@ -17,7 +18,7 @@ from experiments.analysis.pages.contents import (
 from experiments.runs.errors import disk_error
 from experiments.runs.files import replacing
 
-__all__ = ["FloorVisits", "Panel", "Report", "Section", "Series", "Table", "Verdict", "write"]
+__all__ = ["FloorVisits", "Panel", "Reason", "Report", "Section", "Series", "Table", "Verdict", "write"]
 
 
 def write(report: Report, out: Path, refresh: float | None = None) -> Path:

@@ -6,7 +6,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from experiments.analysis.intervals import interval, paired
-from experiments.analysis.pages.contents import Verdict
+from experiments.analysis.pages.contents import Reason, Verdict
 from experiments.analysis.tables import number
 
 Answer = Literal["holds", "does not hold", "undecided", "not run"]
@@ -145,8 +145,8 @@ def _beside(label: str, scores: Scores, compare: Callable[[float, float], tuple[
     return "holds" if good else "does not hold" if bad else "undecided", why
 
 
-def judge(conditions: Sequence[Condition], numbers: Sequence[Numbers]) -> tuple[Verdict, str]:
-    """The claim's answer, and the reasons of all conditions.
+def judge(conditions: Sequence[Condition], numbers: Sequence[Numbers]) -> tuple[Verdict, tuple[Reason, ...]]:
+    """The claim's answer, and what became of each condition.
 
     It holds if every condition does, and does not hold if one of them does not. Where there is nothing to ask, it was
     not run; where only some of it is there, it is undecided. Without conditions nothing was asked.
@@ -156,12 +156,9 @@ def judge(conditions: Sequence[Condition], numbers: Sequence[Numbers]) -> tuple[
         numbers: of each part.
     """
     if not conditions:
-        return "not asked", "no condition decides this one: see the table"
-    found = [condition.decide(numbers[condition.part]) for condition in conditions]
-    answers = [answer for answer, _ in found]
-    why = "; ".join(f"{one.text}: {answer} ({how})" for one, (answer, how) in zip(conditions, found, strict=True))
+        return "not asked", ()
+    reasons = tuple(Reason(one.text, *one.decide(numbers[one.part])) for one in conditions)
+    answers = {reason.verdict for reason in reasons}
     if "does not hold" in answers:
-        return "does not hold", why
-    if all(answer == "not run" for answer in answers):
-        return "not run", why
-    return "holds" if all(answer == "holds" for answer in answers) else "undecided", why
+        return "does not hold", reasons
+    return (answers.pop() if answers in ({"not run"}, {"holds"}) else "undecided"), reasons

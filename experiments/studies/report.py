@@ -191,20 +191,21 @@ def _section(
     beliefs, ranked = _testbed_table(figure, plan, standings)
     numbers.append(Numbers(ranked))
     tables += [beliefs] if beliefs is not None else []
-    verdict, why = judge(figure.conditions, numbers)
-    if figure.unasked:
-        why += f". Not asked: {figure.unasked.rstrip('.')}"
+    verdict, reasons = judge(figure.conditions, numbers)
+    said = [] if reasons else ["No condition decides this one: see the table."]
+    said += [f"Not asked: {figure.unasked.rstrip('.')}."] if figure.unasked else []
     mine = [key for key, job in plan.jobs.items() if figure.name in job.figures]
     left = [key for key in mine if standings[key].state is not State.FINISHED or key in read.damaged]
     if not everything and beliefs is None:
-        verdict, why = "not run", "no run of it is finished"
+        verdict, reasons, said = "not run", (), ["No run of it is finished."]
     elif left:
-        why += f". {len(left)} of {len(mine)} runs are not in it"
-        why += f", {sum(key in failed for key in left)} of them failed" if any(key in failed for key in left) else ""
+        lost = sum(key in failed for key in left)
+        said.append(f"{len(left)} of {len(mine)} runs are not in it" + (f", {lost} of them failed." if lost else "."))
     command = " ".join([PROGRAM, figure.name, f"--preset={plan.preset}", *map(shlex.quote, words)])
     facts = {"preset": plan.preset, **_facts_of(everything, there, asked)}
     facts["at the paper's scale"] = scale.describe(figure, rates)
-    return Section(figure.name, figure.title, figure.source, figure.claim, verdict, why, command, panels, tables, facts)
+    about = (figure.name, figure.title, figure.source, figure.claim)
+    return Section(*about, verdict, " ".join(said), command, panels, tables, facts, reasons)
 
 
 def _lines(plan: Plan, figure: Figure, i: int, read: _Read) -> dict[str, Line]:

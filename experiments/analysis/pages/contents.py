@@ -57,6 +57,19 @@ class Table(NamedTuple):
     caption: str = ""
 
 
+class Reason(NamedTuple):
+    """Something that was asked of a claim."""
+
+    text: str
+    """What must be so."""
+    verdict: Verdict
+    why: str
+
+    def __str__(self) -> str:
+        """All of it in a line."""
+        return f"{self.text}: {self.verdict} ({self.why})"
+
+
 class Section(NamedTuple):
     """A figure or a table of the paper, beside what became of it here."""
 
@@ -72,6 +85,8 @@ class Section(NamedTuple):
     tables: list[Table]
     facts: dict[str, str]
     """What to know of the runs: seeds, steps, wall time, hardware, versions."""
+    reasons: tuple[Reason, ...] = ()
+    """Of the verdict, a line each, below the explanation."""
 
 
 class Report(NamedTuple):

@@ -60,6 +60,16 @@ def _verdict(section: Section) -> str:
     return f'<span class="verdict {kind}"><span aria-hidden="true">{mark}</span> {section.verdict}</span>'
 
 
+def _reasons(section: Section) -> str:
+    """What was asked, a line each: what must be so, whether it is, and why."""
+    lines = "".join(
+        f'<li><span class="{one.verdict.replace(" ", "-")}"><span aria-hidden="true">{MARKS[one.verdict]}</span> '
+        f'{escape(one.text)}: {one.verdict}</span>, <span class="soft">{escape(one.why)}</span></li>'
+        for one in section.reasons
+    )
+    return f'<ul class="reasons">{lines}</ul>' if lines else ""
+
+
 def _section(section: Section) -> str:
     name = slug(section.name)
     panels = zip(section.panels, panel_names(section), strict=True)
@@ -70,7 +80,7 @@ def _section(section: Section) -> str:
             f'<section id="{name}" aria-labelledby="{name}-title">',
             f'<h2 id="{name}-title">{escape(section.title)}</h2><p class="soft">{escape(section.source)}</p>',
             f'<dl class="claim"><dt>The paper</dt><dd>{escape(section.claim)}</dd>',
-            f"<dt>Here</dt><dd>{_verdict(section)} {escape(section.explanation)}</dd></dl>",
+            f"<dt>Here</dt><dd>{_verdict(section)} {escape(section.explanation)}{_reasons(section)}</dd></dl>",
             '<div class="panels">',
             *(
                 _floor(panel, f"p-{own}", own) if isinstance(panel, FloorVisits) else _curves(panel, f"p-{own}", own)

@@ -45,6 +45,7 @@ section{border-top:2px solid var(--rim);margin-top:32px;padding-top:20px}
 white-space:nowrap}
 .holds{color:var(--yes)}.does-not-hold{color:var(--no)}.undecided{color:var(--open);border-style:dashed}
 .not-run,.not-asked{color:var(--soft);border-style:dotted}
+.reasons{list-style:none;padding:0;margin:.4em 0 0}.reasons li{margin:.15em 0}
 dl{display:grid;grid-template-columns:max-content 1fr;gap:.3em 1em;margin:.8em 0}
 dt{color:var(--soft)}dd{margin:0;min-width:0}
 @media (max-width:520px){dl{grid-template-columns:1fr;gap:0}dd{margin-bottom:.5em}}

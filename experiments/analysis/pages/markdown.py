@@ -37,8 +37,10 @@ def _section(section: Section) -> str:
     parts = [
         f'<a id="{slug(section.name)}"></a>\n\n## {plain(section.title)}',
         f"{plain(section.source)}. The paper: {plain(section.claim)}",
-        f"**{MARKS[section.verdict]} {section.verdict}.** {plain(section.explanation)}",
+        f"**{MARKS[section.verdict]} {section.verdict}.** {plain(section.explanation)}".rstrip(),
     ]
+    if section.reasons:
+        parts.append("\n".join(f"- {MARKS[one.verdict]} {plain(str(one))}" for one in section.reasons))
     for panel, name in zip(section.panels, panel_names(section), strict=True):
         own = floor.table(panel) if isinstance(panel, FloorVisits) else curves.table(panel)
         parts += [f"### {plain(panel.title)}", f"![{plain(panel.title)}](pictures/{name}.svg)", _table(own)]

@@ -294,6 +294,7 @@ def test_hostile_text_stays_text(tmp_path: Path):
         panels=[panel],
         tables=[page.Table((HOSTILE, "b"), [(HOSTILE, HOSTILE)], HOSTILE)],
         facts={HOSTILE: HOSTILE},
+        reasons=(page.Reason(HOSTILE, "undecided", HOSTILE),),
     )
     reader = read(tmp_path, page.Report(HOSTILE, [bad], HOSTILE, [HOSTILE]))
     assert reader.wrong == reader.open == []
@@ -307,6 +308,15 @@ def test_hostile_text_stays_text(tmp_path: Path):
     for line in outside.splitlines():
         if line.startswith("|"):
             assert len(re.findall(r"(?<!\\)\|", line)) in (3, 4, 7), line
+
+
+def test_each_reason_has_a_line_and_its_own_mark(tmp_path: Path):
+    reasons = (page.Reason("a ahead of b", "holds", "by 3"), page.Reason("c at 40% or less", "does not hold", "c: 50%"))
+    reader = read(tmp_path, report(section(verdict="does not hold", reasons=reasons)))
+    listed = [" ".join(text.split()) for at, text in reader.all("li")]
+    assert "✓ a ahead of b: holds, by 3" in listed and "✗ c at 40% or less: does not hold, c: 50%" in listed
+    text = (tmp_path / "report.md").read_text(encoding="utf-8")
+    assert "\n- ✓ a ahead of b: holds \\(by 3\\)\n- ✗ c at 40% or less: does not hold" in text
 
 
 def test_verdicts_are_told_apart_without_colour(tmp_path: Path):

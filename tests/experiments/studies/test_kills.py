@@ -104,7 +104,7 @@ def told(out: Path) -> list:
     found = report.make(made, standings, {}, NO_RATES)
     said: list = [found.title, found.notes]
     for section in found.sections:
-        said += [section.verdict, section.explanation, section.tables]
+        said += [section.verdict, section.explanation, section.reasons, section.tables]
         for panel in section.panels:
             assert isinstance(panel, Panel)
             said += [(one.label, one.seeds, one.steps.tolist(), one.values.tolist()) for one in panel.series]

@@ -36,7 +36,8 @@ def test_a_claim_that_holds_and_its_numbers(tmp_path: Path):
     found = make(tmp_path, one, cells={"implicit": {0: 4, 1: 4}, "random": RANDOM})
     (section,) = found.sections
     assert section.verdict == "holds"
-    assert "implicit ahead of random: holds (by 61 ± 0 points of coverage on 2 seeds)" in section.explanation
+    said = [str(one) for one in section.reasons]
+    assert said[0] == "implicit ahead of random: holds (by 61 ± 0 points of coverage on 2 seeds)" and len(said) == 2
     (panel,) = section.panels
     assert isinstance(panel, Panel)
     assert [(series.label, series.seeds) for series in panel.series] == [("implicit", (0, 1)), ("random", (0, 1))]
@@ -64,7 +65,7 @@ def test_runs_that_are_missing_are_said_to_be(tmp_path: Path):
     other = figure("b", (cell("max"),))
     found = make(tmp_path, one, other, cells={}, skip=("random", "max"))
     first, second = found.sections
-    assert first.verdict == "not run" and "no runs of random" in first.explanation
+    assert first.verdict == "not run" and first.reasons[0].why == "no runs of random"
     assert "2 of 4 runs are not in it" in first.explanation
     assert second.verdict == "not run" and not second.panels and not second.tables
     assert found.notes[0] == "2 of 6 runs of these figures are finished."
@@ -110,7 +111,7 @@ def test_a_number_has_one_sign_in_words_and_in_the_table(tmp_path: Path):
     one = figure("a", (cell("implicit"), cell("random")), WHOLE, (ahead("implicit", "random"),))
     (section,) = make(tmp_path, one, cells={"implicit": {0: 4, 1: 4}, "random": RANDOM}).sections
     # `implicit` is whole in the first round of the second half, at step 175, and `random` never, which counts as 300.
-    assert "(by 125 ± 0 steps on 2 seeds)" in section.explanation
+    assert section.reasons[0].why == "by 125 ± 0 steps on 2 seeds"
     head, lines = section.tables[0].head, section.tables[0].lines
     assert lines[1][head.index("implicit ahead by, 95 % by Student's t")] == "125 ± 0"
     never = head.index("never, counted as the last step")
@@ -176,10 +177,9 @@ def test_a_belief_is_judged_by_the_lowest_of_its_correlations(tmp_path: Path):
         job.path.parent.mkdir(exist_ok=True)
         job.path.write_text(json.dumps({"stored": [{"environment": "acrobot", "kinds": kinds}]}))
     (section,) = report.make(made, plan.look_all(made), {}, NO_RATES).sections
-    assert section.verdict == "does not hold" and section.explanation.endswith(". Not asked: the rest")
-    assert (
-        "max's variance and errors correlated by rank: holds (in 1 of 1 fits; the lowest is 0.2)" in section.explanation
-    )
+    assert section.verdict == "does not hold" and section.explanation == "Not asked: the rest."
+    first = str(section.reasons[0])
+    assert first == "max's variance and errors correlated by rank: holds (in 1 of 1 fits; the lowest is 0.2)"
 
 
 def test_runs_of_one_cell_may_differ_in_their_seed_alone(tmp_path: Path):
