@@ -43,8 +43,8 @@ nav ol{padding-left:1.6em;margin:.5em 0}nav li{margin:.35em 0}nav li>*{margin-ri
 section{border-top:2px solid var(--rim);margin-top:32px;padding-top:20px}
 .verdict{display:inline-block;border:1.5px solid;border-radius:4px;padding:0 .45em;font-size:.875rem;font-weight:600;
 white-space:nowrap}
-.holds{color:var(--yes)}.does-not-hold{color:var(--no)}.undecided{color:var(--open);border-style:dashed}
-.not-run,.not-asked{color:var(--soft);border-style:dotted}
+.holds{color:var(--yes)}.does-not-hold{color:var(--no)}.undecided{color:var(--open)}.not-run,.not-asked{color:var(--soft)}
+.verdict.undecided{border-style:dashed}.verdict.not-run,.verdict.not-asked{border-style:dotted}
 .reasons{list-style:none;padding:0;margin:.4em 0 0}.reasons li{margin:.15em 0}
 dl{display:grid;grid-template-columns:max-content 1fr;gap:.3em 1em;margin:.8em 0}
 dt{color:var(--soft)}dd{margin:0;min-width:0}
