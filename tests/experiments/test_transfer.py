@@ -297,6 +297,7 @@ def test_of_a_damaged_checkpoint_no_older_one_takes_the_place(
     assert list(tmp_path.iterdir()) == [broken]
 
 
+@pytest.mark.slow
 def test_a_run_that_has_to_start_over_looks_at_its_parent_again(explored: Path, tmp_path: Path, capsys):
     source, child = tmp_path / "source", tmp_path / "child"
     shutil.copytree(explored, source)
