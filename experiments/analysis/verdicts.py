@@ -161,4 +161,6 @@ def judge(conditions: Sequence[Condition], numbers: Sequence[Numbers]) -> tuple[
     answers = {reason.verdict for reason in reasons}
     if "does not hold" in answers:
         return "does not hold", reasons
-    return (answers.pop() if answers in ({"not run"}, {"holds"}) else "undecided"), reasons
+    if answers == {"not run"}:
+        return "not run", reasons
+    return "holds" if answers == {"holds"} else "undecided", reasons
