@@ -263,9 +263,9 @@ def _stay(asked: _Arguments, board: Board) -> None:
     seconds = asked.every + LINGER
     board.say(f"The report is finished, and served {'until Ctrl-C' if person else f'for {seconds:.0f} s more'}.")
     with contextlib.suppress(KeyboardInterrupt):
-        while person or seconds > 0:
-            time.sleep(min(1.0, max(seconds, 0.0)) or 1.0)
-            seconds -= 1.0
+        time.sleep(seconds)
+        while person:
+            time.sleep(1.0)
 
 
 if __name__ == "__main__":
