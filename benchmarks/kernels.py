@@ -90,9 +90,9 @@ def sac_update(config: ExplorationConfig, rate: float, inner: int) -> Result:
     """One SAC update on a batch drawn from a replay, as a round makes many of them."""
     sac = make_sac(OBS, ACTION, config.sac)
     lesson = lesson_of([(random_data(8192, 8192), config.sac.batch_size)], None, AS_THEY_ARE)
-    nothing = no_learner_metrics(sac, OBS, ACTION)
 
     def updates(state: Any) -> Any:
+        nothing = no_learner_metrics(sac, state, OBS, ACTION)
         return train(sac, jax.random.key(0), state, lesson, inner, nothing)[0]
 
     timing = measure_chain(jax.jit(updates, donate_argnums=0), sac.init(jax.random.key(0)), inner=inner)

@@ -107,9 +107,9 @@ def ours_given(config: SACConfig) -> Callable[[], Any]:
 def ours_many(config: SACConfig, num: int) -> Callable[[], Any]:
     """`num` updates in one program, as a round makes them."""
     sac = make_sac(OBS, ACTION, config)
-    nothing = no_learner_metrics(sac, OBS, ACTION)
 
     def update(key: jax.Array, state: Any, data: Any) -> Any:
+        nothing = no_learner_metrics(sac, state, OBS, ACTION)
         key, train_key = jax.random.split(key)
         lesson = lesson_of([(data, config.batch_size)], None, AS_THEY_ARE)
         return key, train(sac, train_key, state, lesson, num, nothing)

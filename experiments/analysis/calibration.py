@@ -4,7 +4,6 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import stats
 
 from experiments.analysis.figures import FEW_CELLS
 
@@ -56,6 +55,8 @@ def calibration(judged: Judged) -> Calibration | None:
         return None
     error, variance = float(np.mean(judged.error)), float(np.mean(judged.variance))
     predictive = variance + float(np.mean(judged.stated))
+    from scipy import stats  # A second, and every command imports this file.
+
     constant = np.ptp(judged.variance) == 0 or np.ptp(judged.error) == 0
     return Calibration(
         num=num,
@@ -73,6 +74,8 @@ def told_apart(low: np.ndarray, high: np.ndarray) -> float | None:
     """
     if min(len(low), len(high)) < FEWEST:
         return None
+    from scipy import stats
+
     return float(stats.mannwhitneyu(high, low).statistic / (len(low) * len(high)))
 
 

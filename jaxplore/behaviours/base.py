@@ -197,19 +197,27 @@ def train(
             batch = lesson.take(choice)
             reward = (batch.reward - lesson.moments.mean) / lesson.moments.std
             batch = batch._replace(obs=see(batch.obs), next_obs=see(batch.next_obs), reward=reward)
-            return (learner.update_given or learner.update)(noise, carry[0], batch)
+            return traced_once(learner)(noise, carry[0], batch)
 
         return jax.lax.fori_loop(0, jnp.minimum(size, num_updates - b * size), one_update, carry)
 
     return jax.lax.fori_loop(0, jnp.where(wanted, num_blocks, 0), block, (state, metrics))
 
 
-def no_learner_metrics(learner: Learner, obs_size: int, action_size: int) -> Metrics:
-    """Zeros in the shape of the learner's metrics, to start a loop with."""
-    flag, obs = jnp.zeros(1, bool), jnp.zeros((1, obs_size))
-    batch = Transition(obs, jnp.zeros((1, action_size)), jnp.zeros(1), obs, flag, flag)
+def no_learner_metrics(learner: Learner, state: Any, obs_size: int, action_size: int) -> Metrics:
+    """Zeros in the shape of the learner's metrics, to start a loop of its updates of `state` with."""
+    num = learner.batch_size
+    flags, obs = jnp.zeros(num, bool), jnp.zeros((num, obs_size))
+    batch = Transition(obs, jnp.zeros((num, action_size)), jnp.zeros(num), obs, flags, flags)
     key = jax.random.key(0)
-    return no_metrics(lambda: learner.update(key, learner.init(key), batch)[1])
+    return no_metrics(lambda: traced_once(learner)(learner.noise(key) if learner.noise else key, state, batch)[1])
+
+
+def traced_once(learner: Learner) -> Callable[[Any, Any, Transition], tuple[Any, Metrics]]:
+    """An update with its noise, or with its key where it draws for itself, whose trace is kept: asked for its metrics
+    and then for its result, with the same shapes, it is traced once. What it is traced into looks the same.
+    """
+    return jax.jit(learner.update_given or learner.update, inline=True)
 
 
 AS_THEY_ARE = RewardMoments(1.0, 0.0)

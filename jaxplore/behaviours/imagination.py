@@ -191,7 +191,8 @@ def improve(
     real = label(parts.signal, experience) if needs_real else experience.data
     std = parts.signal.std(experience.own)
     obs_size, action_size = parts.example.obs.shape[0], parts.example.action.shape[0]
-    learner_state, metrics = state.learner, no_learner_metrics(learner, obs_size, action_size)
+    learner_state = state.learner
+    metrics = no_learner_metrics(learner, learner_state, obs_size, action_size)
     real_updates = config.real_updates
     if config.real_fraction == 1.0:
         real_updates += max(config.num_rollouts - config.num_random_rollouts, 0) * config.updates_per_rollout

@@ -165,7 +165,7 @@ def train_on_real_data(parts: Reactive, key: Key, state: Any, experience: Experi
     moments = reward_moments(measured, config.normalize_reward, config.center_reward, std)
     normalizers = experience.normalizers if parts.normalize_obs else None
     lesson = lesson_of([(real, learner.batch_size)], normalizers, moments)
-    nothing = no_learner_metrics(learner, *parts.sizes)
+    nothing = no_learner_metrics(learner, state, *parts.sizes)
     return train(learner, key, state, lesson, config.updates, nothing)
 
 

@@ -143,10 +143,12 @@ def fit(
     init_key, steps_key = jax.random.split(key)
     start = belief.init(init_key) if config.restart else state
 
-    def step(i: Array, carry: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
-        return belief.update(jax.random.fold_in(steps_key, i), carry[0], data, normalizers)
+    update = jax.jit(belief.update, inline=True)  # So it is traced once for both of its uses here.
 
-    metrics = no_metrics(lambda: belief.update(steps_key, start, data, normalizers)[1])
+    def step(i: Array, carry: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
+        return update(jax.random.fold_in(steps_key, i), carry[0], data, normalizers)
+
+    metrics = no_metrics(lambda: update(steps_key, start, data, normalizers)[1])
     return jax.lax.fori_loop(0, config.num_steps(num_data), step, (start, metrics))
 
 

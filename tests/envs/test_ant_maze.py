@@ -323,6 +323,7 @@ class TestEpisode:
         assert flags[:299] == [(False, False)] * 299
         assert flags[299:] == [(False, True)] * 2
 
+    @pytest.mark.slow
     def test_device_counts_alike(self, device_start, device_step):
         states = device_start.replace(num_steps=jnp.arange(295, 303, dtype=jnp.int32))
         states, transitions = device_step(states, jnp.zeros((BATCH, 8)))

@@ -74,6 +74,13 @@ def test_a_package_that_is_missing_is_named(package: str, tmp_path: Path):
     assert len(done.stderr.splitlines()) == 1
 
 
+def test_what_a_run_needs_when_it_ends_does_not_keep_it_from_starting():
+    heavy = "('matplotlib.figure', 'scipy.stats', 'scipy.special', 'tensorflow_probability')"
+    program = f"import sys, experiments.run; print([name for name in {heavy} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert (done.stdout, done.stderr) == ("[]\n", "")
+
+
 def test_compiled_programs_are_kept_where_nobody_else_writes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ):

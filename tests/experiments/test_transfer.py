@@ -144,6 +144,7 @@ def test_without_a_warm_up_it_learns_from_the_first_round_on(explored: Path, tmp
     assert 0 < np.abs(moved).max() < 3e-3, "two updates away from the parent's policy, with steps of 3e-4"
 
 
+@pytest.mark.slow
 def test_statistics_stay_as_the_parent_had_them_and_only_there(explored: Path, tmp_path: Path):
     assert run.main([*LEARN, f"--parent={explored}", f"--out={tmp_path / 'child'}"]) == 0
     assert run.main([*LEARN, "--task-sac.hidden", "8", f"--out={tmp_path / 'orphan'}"]) == 0
@@ -421,6 +422,7 @@ def test_a_parent_with_the_same_entries_will_do(theirs: str, own: str, explored:
     assert parent.resolve(RunRef(str(other)), build.make_env(config), agent_of(config), config).step == 81
 
 
+@pytest.mark.slow
 def test_a_policy_by_gradient_ascent_is_handed_on_with_its_form(tmp_path: Path, capsys):
     climbed, method = tmp_path / "climbed", "disagreement_grad"
     form = ("--gradient.activation=tanh", "--gradient.log-std-max=1", "--gradient.no-act-greedily")

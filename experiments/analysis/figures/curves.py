@@ -10,12 +10,10 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, MaxNLocat
 
 from experiments.analysis.figures import panels as layout
 from experiments.analysis.figures.panels import Curves, draw_lines, finish, name_of, panels_of
-from experiments.analysis.figures.style import SOFT, STYLE
+from experiments.analysis.figures.style import FEW_CELLS, SOFT, STYLE
 from experiments.analysis.intervals import interval
 from experiments.runs.scene import Cells
 
-FEW_CELLS = 12
-"""Up to so many coverage cells are shown one by one."""
 MOST_EPISODES = 40
 """Up to so many episodes are worth counting along an axis."""
 

@@ -1,17 +1,24 @@
-"""What all pictures share: colours, fonts, and a file that is replaced as a whole. The only file that needs matplotlib
-to be there.
+"""What all pictures share: colours, fonts, and a file that is replaced as a whole. The first file to need
+matplotlib, of which it imports little: the rest comes with the first picture.
 """
 
+import importlib
 import os
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from experiments.runs.errors import RunError, disk_error
 from experiments.runs.files import replacing
 
 try:
-    from matplotlib.figure import Figure
+    importlib.import_module("matplotlib")  # a quarter of a second, half a second less than matplotlib.figure
 except ImportError as error:
     raise RunError('pictures need matplotlib. What to do: pip install -e ".[experiments]".') from error
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FEW_CELLS = 12
+"""Up to so many coverage cells are shown one by one."""
 
 # Okabe and Ito's colours, told apart with any kind of colour vision.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -36,7 +43,7 @@ STYLE: Any = {
 }
 
 
-def save(figure: Figure, path: str | os.PathLike[str]) -> None:
+def save(figure: "Figure", path: str | os.PathLike[str]) -> None:
     """Write a figure as PNG, whole or not at all.
 
     Raises:

@@ -242,6 +242,7 @@ def test_without_out_they_make_a_place_of_their_own(here, point: str, tmp_path: 
 # Resumed.
 
 
+@pytest.mark.slow
 def test_what_is_finished_is_kept_and_the_rest_goes_on(here, tell, point: str, tmp_path: Path):
     out = tmp_path / "run"
     here.fails = {1: lambda: End(-9, "killed"), 2: lambda: End(1, "the disk is full")}

@@ -43,6 +43,7 @@ def test_an_axis_of_the_mesh_is_named_or_the_only_one():
         state_shardings(leaf, grid, "column")
 
 
+@pytest.mark.slow
 def test_eight_devices_hold_an_eighth_each_and_learn_as_one_does():
     found = devices.result(devices.start("tests.jaxplore.beliefs.on_eight_devices", num_devices=8))
     # the 64 x 64 weights of the middle layer, from 16 features and their constant
