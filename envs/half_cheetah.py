@@ -1,6 +1,6 @@
-"""Gymnasium's half cheetah in two forms: MAX's for exploration, and Gymnasium's own for the task of running.
+"""Gymnasium's half cheetah: MAX's form for exploration, Gymnasium's own for the task of running, and one between.
 
-A planar two-legged body of 14 kg on a floor, six hinges, 0.05 s a step. Both forms have one model and one reset; both
+A planar two-legged body of 14 kg on a floor, six hinges, 0.05 s a step. All forms have one model and one reset, and
 are never terminated by the task.
 
 - `half_cheetah` (nnaisense/max, MagellanHalfCheetah): 100 steps, 19 numbers, no reward. Its coverage is counted on the
@@ -9,10 +9,14 @@ are never terminated by the task.
 - `half_cheetah_task` (Gymnasium's HalfCheetah-v5): 1,000 steps, 17 numbers, reward: mean velocity along x over the step
   [m/s] minus 0.1 times the sum of the squared actions. The paper's authors transfer their policy to the same reward in
   the same 1,000 steps.
+- `half_cheetah_sincos`: that task, its pitch seen as MAX sees it, by sine and cosine: 18 numbers. Gymnasium's pitch is
+  an angle that no bound holds: two somersaults later the same posture is another state, which is new to whoever looks
+  for new states, and strange to what has learned of the first.
 """
 # pyright: reportAttributeAccessIssue=false
 # mujoco ships no stubs.
 
+import dataclasses
 from importlib import resources
 from types import ModuleType
 from typing import Any
@@ -61,6 +65,11 @@ TASK_SPEC = EnvSpec(
     episode_steps=1_000,
     dt=DT,
     has_reward=True,
+)
+SINCOS_SPEC = dataclasses.replace(
+    TASK_SPEC,
+    name="half_cheetah_sincos",
+    obs_names=("z above the start [m]", "sine of pitch", "cosine of pitch", *JOINT_ANGLES, *VELOCITIES),
 )
 
 FASTEST = (5.0, 10.0)
@@ -120,6 +129,11 @@ def observe_task(xp: ModuleType, qpos_before: Any, qpos: Any, qvel: Any) -> Any:
     return xp.concatenate([qpos[1:], qvel])
 
 
+def observe_sincos(xp: ModuleType, qpos_before: Any, qpos: Any, qvel: Any) -> Any:
+    """Gymnasium's observation with the sine and cosine of its pitch, `[18]`."""
+    return observe(xp, qpos_before, qpos, qvel)[1:]
+
+
 def forward_reward(xp: ModuleType, action: Any, qpos_before: Any, qpos: Any, qvel: Any) -> Any:
     """Gymnasium's reward: mean x velocity over the step [m/s] minus `CONTROL_COST` times the squared actions' sum."""
     return (qpos[0] - qpos_before[0]) / DT - CONTROL_COST * xp.sum(xp.square(action))
@@ -148,6 +162,13 @@ def make_half_cheetah_task(backend: str = "auto", obs_noise: float = 0.0) -> Env
     An episode is truncated at step 1,000; else as `make_half_cheetah`, arguments and errors too.
     """
     return _make(TASK_SPEC, observe_task, forward_reward, backend, obs_noise)
+
+
+def make_half_cheetah_sincos(backend: str = "auto", obs_noise: float = 0.0) -> Environment:
+    """The task of `make_half_cheetah_task`, pitch as sine and cosine. Observations `[18]`; arguments and errors as
+    there.
+    """
+    return _make(SINCOS_SPEC, observe_sincos, forward_reward, backend, obs_noise)
 
 
 def _make(spec: EnvSpec, observe: Any, reward: Any, backend: str, obs_noise: float) -> Environment:

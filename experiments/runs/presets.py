@@ -157,8 +157,9 @@ TASK_EXPLORER = {"warm_up_steps": 10_000, "data_capacity": 1_000_000}
 """A replay that holds them all, 160 MB, and the warm-up of haarnoja/sac and of the paper."""
 
 WITH_A_TASK: dict[tuple[str, str], tuple[dict[str, Any], dict[str, Any]]] = {
-    ("half_cheetah_task", "laptop"): (TASK_RUN, TASK_EXPLORER),
-    ("half_cheetah_task", "paper"): (TASK_RUN, TASK_EXPLORER),
+    (env, preset): (TASK_RUN, TASK_EXPLORER)
+    for env in ("half_cheetah_sincos", "half_cheetah_task")
+    for preset in ("laptop", "paper")
 }
 """Environment and preset -> what the run, and its explorer, have where the task's reward is learned from, and not
 otherwise."""
