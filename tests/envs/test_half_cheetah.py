@@ -8,7 +8,17 @@ import pytest
 import envs
 from envs import half_cheetah
 from envs.engines import host as host_engine
-from envs.half_cheetah import DT, GEARS, SPEC, TASK_SPEC, make_half_cheetah, make_half_cheetah_task, make_model
+from envs.half_cheetah import (
+    DT,
+    GEARS,
+    SINCOS_SPEC,
+    SPEC,
+    TASK_SPEC,
+    make_half_cheetah,
+    make_half_cheetah_sincos,
+    make_half_cheetah_task,
+    make_model,
+)
 
 BATCH = 8
 
@@ -26,6 +36,11 @@ def host():
 @pytest.fixture(scope="module")
 def task():
     return make_half_cheetah_task("mujoco")
+
+
+@pytest.fixture(scope="module")
+def sincos():
+    return make_half_cheetah_sincos("mujoco")
 
 
 def host_state(env, qpos, qvel):
@@ -94,6 +109,7 @@ class TestModel:
         assert host.view.cameras == ("track", "side")
         assert envs.make("half_cheetah", backend="mujoco").spec is SPEC
         assert envs.make("half_cheetah_task", backend="mujoco").spec is TASK_SPEC
+        assert envs.make("half_cheetah_sincos", backend="mujoco").spec is SINCOS_SPEC
 
 
 class TestAgainstGymnasium:
@@ -142,6 +158,25 @@ class TestObservation:
             np.testing.assert_allclose(transition.next_obs, np.float32(expected), rtol=1e-6)
             assert transition.reward == 0
 
+    def test_somersaults_later_the_same_posture_looks_the_same(self, task, sincos):
+        assert (SINCOS_SPEC.obs_size, SINCOS_SPEC.episode_steps, SINCOS_SPEC.has_reward) == (18, 1000, True)
+        rng = np.random.default_rng(0)
+        qpos, qvel = rng.uniform(-0.1, 0.1, 9), rng.normal(0, 3, 9)
+        turned = qpos + 6 * np.pi * (np.arange(9) == 2)
+        once, later = (host_state(sincos, start, qvel) for start in (qpos, turned))
+        plain = host_state(task, turned, qvel)
+        for _ in range(5):
+            action = rng.uniform(-1, 1, 6)
+            (once, first), (later, then), (plain, as_it_is) = (
+                env.step(state, action) for env, state in ((sincos, once), (sincos, later), (task, plain))
+            )
+            np.testing.assert_allclose(first.next_obs, then.next_obs, atol=1e-5)
+            angle = as_it_is.next_obs[1]
+            assert angle > 5 * np.pi
+            expected = [as_it_is.next_obs[0], np.sin(angle), np.cos(angle), *as_it_is.next_obs[2:]]
+            np.testing.assert_allclose(then.next_obs, expected, atol=1e-5)
+            assert then.reward == as_it_is.reward != 0
+
     def test_same_key_same_state(self, host):
         first, again, other = (host.reset(jax.random.key(seed)) for seed in (3, 3, 4))
         np.testing.assert_array_equal(first.obs, again.obs)
@@ -165,10 +200,10 @@ class TestObservation:
 
 
 class TestCoverage:
-    def test_cells_are_speed_and_pitch_rate(self, host, task):
+    def test_cells_are_speed_and_pitch_rate(self, host, task, sincos):
         assert host.coverage.num_cells == task.coverage.num_cells == 400
         speed, rate = np.meshgrid(np.arange(-4.75, 5, 0.5), np.arange(-9.5, 10), indexing="ij")
-        for env, dims in ((host, (0, 12)), (task, (8, 10))):
+        for env, dims in ((host, (0, 12)), (task, (8, 10)), (sincos, (9, 11))):
             obs = np.zeros((400, env.spec.obs_size), np.float32)
             obs[:, dims[0]], obs[:, dims[1]] = speed.ravel(), rate.ravel()
             np.testing.assert_array_equal(jax.jit(jax.vmap(env.coverage.cell))(obs), np.arange(400))
