@@ -9,7 +9,7 @@ are never terminated by the task.
 - `half_cheetah_task` (Gymnasium's HalfCheetah-v5): 1,000 steps, 17 numbers, reward: mean velocity along x over the step
   [m/s] minus 0.1 times the sum of the squared actions. The paper's authors transfer their policy to the same reward in
   the same 1,000 steps.
-- `half_cheetah_sincos`: that task, its pitch seen as MAX sees it, by sine and cosine: 18 numbers. Gymnasium's pitch is
+- `half_cheetah_transfer`: that task, its pitch seen as MAX sees it, by sine and cosine: 18 numbers. Gymnasium's pitch is
   an angle that no bound holds: two somersaults later the same posture is another state, which is new to whoever looks
   for new states, and strange to what has learned of the first.
 """
@@ -66,9 +66,9 @@ TASK_SPEC = EnvSpec(
     dt=DT,
     has_reward=True,
 )
-SINCOS_SPEC = dataclasses.replace(
+TRANSFER_SPEC = dataclasses.replace(
     TASK_SPEC,
-    name="half_cheetah_sincos",
+    name="half_cheetah_transfer",
     obs_names=("z above the start [m]", "sine of pitch", "cosine of pitch", *JOINT_ANGLES, *VELOCITIES),
 )
 
@@ -164,11 +164,11 @@ def make_half_cheetah_task(backend: str = "auto", obs_noise: float = 0.0) -> Env
     return _make(TASK_SPEC, observe_task, forward_reward, backend, obs_noise)
 
 
-def make_half_cheetah_sincos(backend: str = "auto", obs_noise: float = 0.0) -> Environment:
+def make_half_cheetah_transfer(backend: str = "auto", obs_noise: float = 0.0) -> Environment:
     """The task of `make_half_cheetah_task`, pitch as sine and cosine. Observations `[18]`; arguments and errors as
     there.
     """
-    return _make(SINCOS_SPEC, observe_sincos, forward_reward, backend, obs_noise)
+    return _make(TRANSFER_SPEC, observe_sincos, forward_reward, backend, obs_noise)
 
 
 def _make(spec: EnvSpec, observe: Any, reward: Any, backend: str, obs_noise: float) -> Environment:

@@ -11,7 +11,7 @@ IDS = {
     "jaxplore/Acrobot-v0": "acrobot",
     "jaxplore/AntMaze-v0": "ant_maze",
     "jaxplore/HalfCheetah-v0": "half_cheetah",
-    "jaxplore/HalfCheetahSincos-v0": "half_cheetah_sincos",
+    "jaxplore/HalfCheetahTransfer-v0": "half_cheetah_transfer",
     "jaxplore/HalfCheetahTask-v0": "half_cheetah_task",
     "jaxplore/HandBlock-v0": "hand_block",
     "jaxplore/MountainCar-v0": "mountain_car",

@@ -11,11 +11,11 @@ from envs.engines import host as host_engine
 from envs.half_cheetah import (
     DT,
     GEARS,
-    SINCOS_SPEC,
+    TRANSFER_SPEC,
     SPEC,
     TASK_SPEC,
     make_half_cheetah,
-    make_half_cheetah_sincos,
+    make_half_cheetah_transfer,
     make_half_cheetah_task,
     make_model,
 )
@@ -40,7 +40,7 @@ def task():
 
 @pytest.fixture(scope="module")
 def sincos():
-    return make_half_cheetah_sincos("mujoco")
+    return make_half_cheetah_transfer("mujoco")
 
 
 def host_state(env, qpos, qvel):
@@ -109,7 +109,7 @@ class TestModel:
         assert host.view.cameras == ("track", "side")
         assert envs.make("half_cheetah", backend="mujoco").spec is SPEC
         assert envs.make("half_cheetah_task", backend="mujoco").spec is TASK_SPEC
-        assert envs.make("half_cheetah_sincos", backend="mujoco").spec is SINCOS_SPEC
+        assert envs.make("half_cheetah_transfer", backend="mujoco").spec is TRANSFER_SPEC
 
 
 class TestAgainstGymnasium:
@@ -159,7 +159,7 @@ class TestObservation:
             assert transition.reward == 0
 
     def test_somersaults_later_the_same_posture_looks_the_same(self, task, sincos):
-        assert (SINCOS_SPEC.obs_size, SINCOS_SPEC.episode_steps, SINCOS_SPEC.has_reward) == (18, 1000, True)
+        assert (TRANSFER_SPEC.obs_size, TRANSFER_SPEC.episode_steps, TRANSFER_SPEC.has_reward) == (18, 1000, True)
         rng = np.random.default_rng(0)
         qpos, qvel = rng.uniform(-0.1, 0.1, 9), rng.normal(0, 3, 9)
         turned = qpos + 6 * np.pi * (np.arange(9) == 2)

@@ -111,9 +111,9 @@ def test_help_shows_first_what_the_method_reads(capsys: pytest.CaptureFixture[st
 
 
 def test_environments_say_whether_there_is_a_reward():
-    have = {"acrobot", "half_cheetah_sincos", "half_cheetah_task", "mountain_car", "nchain"}
+    have = {"acrobot", "half_cheetah_transfer", "half_cheetah_task", "mountain_car", "nchain"}
     from envs import acrobot, ant_maze, half_cheetah, hand_block, mountain_car
 
-    cheetahs = [half_cheetah.SPEC, half_cheetah.SINCOS_SPEC, half_cheetah.TASK_SPEC]
+    cheetahs = [half_cheetah.SPEC, half_cheetah.TRANSFER_SPEC, half_cheetah.TASK_SPEC]
     specs = [acrobot.SPEC, ant_maze.SPEC, *cheetahs, hand_block.SPEC, mountain_car.SPEC]
     assert {spec.name for spec in [*specs, envs.make("nchain").spec] if spec.has_reward} == have

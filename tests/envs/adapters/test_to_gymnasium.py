@@ -15,7 +15,7 @@ from envs.views import make_sketch_view
 NAMES = {
     "ant_maze": "jaxplore/AntMaze-v0",
     "half_cheetah": "jaxplore/HalfCheetah-v0",
-    "half_cheetah_sincos": "jaxplore/HalfCheetahSincos-v0",
+    "half_cheetah_transfer": "jaxplore/HalfCheetahTransfer-v0",
     "hand_block": "jaxplore/HandBlock-v0",
     "acrobot": "jaxplore/Acrobot-v0",
     "mountain_car": "jaxplore/MountainCar-v0",
