@@ -14,7 +14,7 @@ from envs.acrobot import make_acrobot
 from envs.adapters import to_gymnasium
 from envs.ant_maze import make_ant_maze
 from envs.base import Coverage, Environment, EnvSpec, EnvState, FloorPlan
-from envs.half_cheetah import make_half_cheetah, make_half_cheetah_transfer, make_half_cheetah_task
+from envs.half_cheetah import make_half_cheetah, make_half_cheetah_task, make_half_cheetah_transfer
 from envs.hand_block import make_hand_block
 from envs.mountain_car import make_mountain_car
 from envs.nchain import make_nchain
@@ -25,8 +25,8 @@ FACTORIES: dict[str, Callable[..., Environment]] = {
     "acrobot": make_acrobot,
     "ant_maze": make_ant_maze,
     "half_cheetah": make_half_cheetah,
-    "half_cheetah_transfer": make_half_cheetah_transfer,
     "half_cheetah_task": make_half_cheetah_task,
+    "half_cheetah_transfer": make_half_cheetah_transfer,
     "hand_block": make_hand_block,
     "mountain_car": make_mountain_car,
     "nchain": make_nchain,

@@ -158,7 +158,7 @@ TASK_EXPLORER = {"warm_up_steps": 10_000, "data_capacity": 1_000_000}
 
 WITH_A_TASK: dict[tuple[str, str], tuple[dict[str, Any], dict[str, Any]]] = {
     (env, preset): (TASK_RUN, TASK_EXPLORER)
-    for env in ("half_cheetah_transfer", "half_cheetah_task")
+    for env in ("half_cheetah_task", "half_cheetah_transfer")
     for preset in ("laptop", "paper")
 }
 """Environment and preset -> what the run, and its explorer, have where the task's reward is learned from, and not
