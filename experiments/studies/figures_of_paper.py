@@ -130,7 +130,8 @@ ACROBOT = _cells("acrobot", (OURS, *RIVALS), CONTROL_SEEDS, ACROBOT_STEPS, TEN_S
 ANT = _cells("ant_maze", (OURS, "random", "icm", "disagreement", "max"), CONTROL_SEEDS, MAZE_STEPS, TEN_SEEDS)
 HAND = _cells("hand_block", (OURS, *RIVALS), CONTROL_SEEDS, EXPLORE_STEPS)
 
-TASK = "half_cheetah_task"
+TASK = "half_cheetah_transfer"
+"""As the paper's authors have it: seen in MAX's way, without the angle that somersaults wind up without end."""
 SAME_WIDTHS = {"laptop": (128, 128), "smoke": (32, 32), "paper": (256, 256)}
 """Of SAC's networks while it explores and on the task: one takes over the other's."""
 SAME_FORM = {"activation": "relu", "log_std_map": "clip", "log_std_min": -20.0, "log_std_max": 2.0}
