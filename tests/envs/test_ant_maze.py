@@ -353,6 +353,7 @@ class TestEpisode:
                 np.testing.assert_array_equal(a, b)
         np.testing.assert_array_equal(saved.physics, frozen)
 
+    @pytest.mark.slow
     def test_a_saved_device_state_continues_to_the_bit(self, device_start, device_step):
         states = device_start
         actions = np.random.default_rng(0).uniform(-1, 1, (12, BATCH, 8)).astype(np.float32)
