@@ -49,7 +49,7 @@ while sum(killed.values()) < kills:
     while not done and victim == "worker" and not workers():
         time.sleep(0.1)
         done, status = os.waitpid(pid, os.WNOHANG)
-    time.sleep(draw.uniform(0.1, 3.0 if victim == "worker" else 12.0))
+    time.sleep(draw.uniform(0.1, 1.5 if victim == "worker" else 5.0))
     if not done:
         done, status = os.waitpid(pid, os.WNOHANG)
     if done:
