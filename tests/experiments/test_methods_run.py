@@ -17,7 +17,7 @@ NO_REWARD = ("ddqn", "psne", "psne_no_norm", "sac", "sac_v2", "sac_explorer", "r
 """Methods without an intrinsic reward."""
 
 
-ONE_OF_EACH = ("implicit", "disagreement_grad", "rnd", "ddqn", "psne", "sac", "random")
+ONE_OF_EACH = ("implicit", "icm", "disagreement_grad", "rnd", "ddqn", "psne", "sac", "random")
 """Every kind of behaviour and most signals; the others are further pairs, and `jaxplore/test_baselines.py` has a round
 of each."""
 

@@ -189,7 +189,7 @@ def test_unwritable_pictures_are_named(tmp_path: Path):
         plot_coverage(tmp_path / "file" / "c.png", [Curves("implicit", STEPS, seeds(1))], COVERAGE)
 
 
-QUICK = {(1, 2), (2, None), (4, None), (5, 2), (8, 2), (9, None)}
+QUICK = {(1, 2), (2, None), (4, None), (5, 2), (8, None), (8, 2), (9, None), (25, 2)}
 """Each number of curves, and each form of the legend, once; the other pairs are slow together."""
 
 
