@@ -45,6 +45,21 @@ def no_metrics(call: Callable[[], Metrics]) -> Metrics:
     return jax.tree.map(lambda shape: jnp.zeros(shape.shape, shape.dtype), jax.eval_shape(call))
 
 
+def traced_once(call: Callable[..., Any]) -> Callable[..., Any]:
+    """The function with its trace kept: asked for its metrics (`no_metrics`) and then for its result, at the same
+    shapes, it is traced once. What it is traced into looks the same.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> traces = []
+        >>> double = traced_once(lambda x: (traces.append(1), 2 * x)[1])
+        >>> shape, result = jax.eval_shape(double, jnp.ones(3)), double(jnp.ones(3))
+        >>> len(traces)
+        1
+    """
+    return jax.jit(call, inline=True)
+
+
 class Transition(NamedTuple):
     """One environment step, or any batch of them. Leading axes are free; the entries share them.
 

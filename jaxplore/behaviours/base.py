@@ -16,7 +16,7 @@ from jaxplore.dynamics import Normalizers
 from jaxplore.learners.base import Learner
 from jaxplore.replay import Replay
 from jaxplore.signals.base import Signal
-from jaxplore.types import Array, Key, Metrics, Transition, no_metrics
+from jaxplore.types import Array, Key, Metrics, Transition, no_metrics, traced_once
 
 DRAWN_AHEAD = 64
 """Updates whose random numbers are drawn at once, at most, to bound memory."""
@@ -197,7 +197,7 @@ def train(
             batch = lesson.take(choice)
             reward = (batch.reward - lesson.moments.mean) / lesson.moments.std
             batch = batch._replace(obs=see(batch.obs), next_obs=see(batch.next_obs), reward=reward)
-            return traced_once(learner)(noise, carry[0], batch)
+            return traced_once(learner.update_given or learner.update)(noise, carry[0], batch)
 
         return jax.lax.fori_loop(0, jnp.minimum(size, num_updates - b * size), one_update, carry)
 
@@ -210,14 +210,8 @@ def no_learner_metrics(learner: Learner, state: Any, obs_size: int, action_size:
     flags, obs = jnp.zeros(num, bool), jnp.zeros((num, obs_size))
     batch = Transition(obs, jnp.zeros((num, action_size)), jnp.zeros(num), obs, flags, flags)
     key = jax.random.key(0)
-    return no_metrics(lambda: traced_once(learner)(learner.noise(key) if learner.noise else key, state, batch)[1])
-
-
-def traced_once(learner: Learner) -> Callable[[Any, Any, Transition], tuple[Any, Metrics]]:
-    """An update with its noise, or with its key where it draws for itself, whose trace is kept: asked for its metrics
-    and then for its result, with the same shapes, it is traced once. What it is traced into looks the same.
-    """
-    return jax.jit(learner.update_given or learner.update, inline=True)
+    noise = learner.noise(key) if learner.noise else key
+    return no_metrics(lambda: traced_once(learner.update_given or learner.update)(noise, state, batch)[1])
 
 
 AS_THEY_ARE = RewardMoments(1.0, 0.0)

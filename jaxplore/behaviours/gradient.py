@@ -28,7 +28,7 @@ from jaxplore.networks import (
     tanh_mean,
 )
 from jaxplore.signals.base import Signal
-from jaxplore.types import Array, Key, Metrics, Params, no_metrics
+from jaxplore.types import Array, Key, Metrics, Params, no_metrics, traced_once
 from jaxplore.validate import Checks
 
 
@@ -244,11 +244,12 @@ def improve(
     """One round of gradient steps, from a new policy if the configuration says so."""
     init_key, updates_key = jax.random.split(key)
     start = init(parts, init_key) if parts.config.restart else state
+    step = traced_once(functools.partial(update, parts))
 
     def one(i: Array, carry: tuple[GradientPolicyState, Metrics]) -> tuple[GradientPolicyState, Metrics]:
-        return update(parts, jax.random.fold_in(updates_key, i), carry[0], experience)
+        return step(jax.random.fold_in(updates_key, i), carry[0], experience)
 
-    metrics = no_metrics(lambda: update(parts, updates_key, start, experience)[1])
+    metrics = no_metrics(lambda: step(updates_key, start, experience)[1])
     return jax.lax.fori_loop(0, parts.config.updates, one, (start, metrics))
 
 

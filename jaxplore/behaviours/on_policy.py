@@ -18,7 +18,7 @@ from jaxplore.learners.ppo import PPO, PPOConfig, PPOState, Rollout, make_ppo, m
 from jaxplore.normalizer import Normalizer
 from jaxplore.signals.base import Learning, Seen, Signal
 from jaxplore.signals.distillation import newest
-from jaxplore.types import Array, Key, Metrics, Transition, no_metrics
+from jaxplore.types import Array, Key, Metrics, Transition, no_metrics, traced_once
 from jaxplore.validate import FieldError
 
 
@@ -214,8 +214,9 @@ def improve(parts: OnPolicy, key: Key, state: OnPolicyState, experience: Experie
     taken = experience.num_data - parts.warm_up_steps
     length = parts.config.rollout_steps
     is_due = taken // length > jnp.maximum(taken - parts.steps_per_round, 0) // length
-    nothing = no_metrics(lambda: learn(parts, key, state, experience)[1])
-    after, metrics = jax.lax.cond(is_due, lambda: learn(parts, key, state, experience), lambda: (state, nothing))
+    learned = traced_once(functools.partial(learn, parts))
+    nothing = no_metrics(lambda: learned(key, state, experience)[1])
+    after, metrics = jax.lax.cond(is_due, lambda: learned(key, state, experience), lambda: (state, nothing))
     return after, {**metrics, **seen}
 
 

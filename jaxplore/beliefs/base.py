@@ -15,7 +15,7 @@ import optax
 from jaxplore import validate
 from jaxplore.dynamics import DELTA, Encoding, Normalizers, Prediction
 from jaxplore.replay import Replay
-from jaxplore.types import Array, Key, Metrics, Transition, no_metrics
+from jaxplore.types import Array, Key, Metrics, Transition, no_metrics, traced_once
 from jaxplore.validate import Checks
 
 
@@ -143,7 +143,7 @@ def fit(
     init_key, steps_key = jax.random.split(key)
     start = belief.init(init_key) if config.restart else state
 
-    update = jax.jit(belief.update, inline=True)  # So it is traced once for both of its uses here.
+    update = traced_once(belief.update)
 
     def step(i: Array, carry: tuple[Any, Metrics]) -> tuple[Any, Metrics]:
         return update(jax.random.fold_in(steps_key, i), carry[0], data, normalizers)
